@@ -1,0 +1,333 @@
+"""The nouns every stage shares: clouds, parts, rigid transforms, graphs, waypoints, registrations.
+
+Arrays are float64, millimetres, frame RAS+ (x to the patient's right, y to the front, z to the head) unless a
+cloud comes from a tracker, whose base frame is any rigid motion of that. They are read-only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import shortest_path
+from scipy.spatial.transform import Rotation
+
+from study.errors import StudyError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+MIN_POINTS = 50
+MIN_EXTENT_MM = 20.0
+MAX_EXTENT_MM = 2000.0
+
+
+class Part(IntEnum):
+    """A labelled piece of the anterior chest wall; sides are the patient's."""
+
+    UNKNOWN = -1
+    STERNUM = 0
+    RIGHT_2 = 1
+    RIGHT_3 = 2
+    RIGHT_4 = 3
+    RIGHT_5 = 4
+    LEFT_2 = 5
+    LEFT_3 = 6
+    LEFT_4 = 7
+    LEFT_5 = 8
+
+    @property
+    def level(self) -> int:
+        """Rib level 2-5 of a cartilage; 0 for the sternum and unknown points."""
+        return 0 if self <= 0 else (self - 1) % 4 + 2
+
+    @property
+    def side(self) -> str:
+        """``"right"``, ``"left"`` or ``""`` for the sternum and unknown points."""
+        return "" if self <= 0 else ("right" if self <= 4 else "left")
+
+    @classmethod
+    def cartilage(cls, side: str, level: int) -> Part:
+        """The cartilage of ``side`` (``"right"`` or ``"left"``) and ``level`` (2-5)."""
+        if side not in ("right", "left") or level not in (2, 3, 4, 5):
+            raise StudyError(f"expected side right|left and level 2-5, got {side!r} and {level!r}")
+        return cls(level - 1 if side == "right" else level + 3)
+
+
+CARTILAGES: tuple[Part, ...] = tuple(part for part in Part if part > 0)
+
+
+def as_points(points: ArrayLike, name: str = "points", *, at_least: int = 1) -> Floats:
+    """Check and copy ``points`` as a read-only (n, 3) float64 array.
+
+    Raises:
+        StudyError: wrong shape, fewer than ``at_least`` rows, or a value that is not finite.
+    """
+    try:
+        array = np.array(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise StudyError(f"{name}: expected numbers of shape (n, 3), got {type(points).__name__}: {error}") from error
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise StudyError(f"{name}: expected shape (n, 3), got {array.shape}; pass one x, y, z row per point")
+    if len(array) < at_least:
+        raise StudyError(f"{name}: expected at least {at_least} points, got {len(array)}; check the crop or the file")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise StudyError(
+            f"{name}: expected finite numbers, got {bad.size} rows with NaN or infinity (first: row {bad[0]}); drop them"
+        )
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """A cloud of surface points of sternum and cartilages.
+
+    Attributes:
+        points: (n, 3) mm.
+        name: what the cloud is, for messages: ``"ct:lidc-0001"``.
+        parts: (n,) int64 of `Part`, or None before labelling.
+
+    Raises:
+        StudyError: shape, NaN, fewer than 50 points, or an extent that cannot be a chest in millimetres.
+    """
+
+    points: Floats
+    name: str = "cloud"
+    parts: Ints | None = None
+
+    def __post_init__(self) -> None:
+        points = as_points(self.points, self.name, at_least=MIN_POINTS)
+        extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+        if not MIN_EXTENT_MM <= extent <= MAX_EXTENT_MM:
+            hint = "; metres? multiply by 1000" if 0.02 <= extent < 2.0 else "; check the units"
+            raise StudyError(
+                f"{self.name}: expected a chest of {MIN_EXTENT_MM:g}-{MAX_EXTENT_MM:g} mm across, got {extent:.3g} mm{hint}"
+            )
+        object.__setattr__(self, "points", points)
+        if self.parts is not None:
+            parts = np.array(self.parts, dtype=np.int64)
+            if parts.shape != (len(points),):
+                raise StudyError(f"{self.name}: expected one part per point {(len(points),)}, got {parts.shape}")
+            parts.flags.writeable = False
+            object.__setattr__(self, "parts", parts)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def only(self, *parts: Part) -> Floats:
+        """The points of some parts, (k, 3) mm."""
+        if self.parts is None:
+            raise StudyError(f"{self.name}: expected labelled parts, got none; run study.cartilage.label_parts first")
+        return self.points[np.isin(self.parts, [int(part) for part in parts])]
+
+    def moved(self, transform: RigidTransform) -> PointCloud:
+        """The same cloud in another frame."""
+        return replace(self, points=transform.apply(self.points))
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle surface.
+
+    Attributes:
+        vertices: (v, 3) mm.
+        faces: (f, 3) indices into ``vertices``, wound so that normals point outwards.
+        parts: (v,) int64 of `Part`.
+    """
+
+    vertices: Floats
+    faces: Ints
+    parts: Ints
+    name: str = "mesh"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices", as_points(self.vertices, self.name, at_least=4))
+        for key in ("faces", "parts"):
+            array = np.array(getattr(self, key), dtype=np.int64)
+            array.flags.writeable = False
+            object.__setattr__(self, key, array)
+        if self.faces.ndim != 2 or self.faces.shape[1] != 3 or len(self.faces) == 0:
+            raise StudyError(f"{self.name}: expected triangles of shape (f, 3), got {self.faces.shape}")
+        if self.parts.shape != (len(self.vertices),):
+            raise StudyError(f"{self.name}: expected one part per vertex, got {self.parts.shape}")
+
+    def moved(self, transform: RigidTransform) -> Mesh:
+        """The same surface in another frame."""
+        return replace(self, vertices=transform.apply(self.vertices))
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """A proper rigid motion, ``T.apply(p) = R p + t``; ``T_a_b`` maps frame b to frame a.
+
+    Attributes:
+        rotation: (3, 3), determinant +1.
+        translation: (3,) mm.
+    """
+
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+    translation: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        rotation = np.array(self.rotation, dtype=np.float64)
+        translation = np.array(self.translation, dtype=np.float64)
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise StudyError(f"expected a (3, 3) rotation and (3,) translation, got {rotation.shape}, {translation.shape}")
+        proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+        if not (proper and np.isfinite(translation).all()):
+            raise StudyError("expected a proper rotation (det +1) and a finite translation, got something else")
+        rotation.flags.writeable = False
+        translation.flags.writeable = False
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> RigidTransform:
+        """From a (4, 4) homogeneous matrix."""
+        array = np.asarray(matrix, dtype=np.float64)
+        if array.shape != (4, 4):
+            raise StudyError(f"expected a (4, 4) matrix, got {array.shape}")
+        return cls(array[:3, :3], array[:3, 3])
+
+    @classmethod
+    def random(cls, rng: np.random.Generator, shift_mm: float = 300.0) -> RigidTransform:
+        """A uniform random rotation and a normal translation of ``shift_mm`` per axis."""
+        return cls(Rotation.random(random_state=rng).as_matrix(), rng.normal(scale=shift_mm, size=3))
+
+    @property
+    def matrix(self) -> Floats:
+        """(4, 4) homogeneous matrix."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
+    @property
+    def inverse(self) -> RigidTransform:
+        """The motion that undoes this one."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    @property
+    def angle_deg(self) -> float:
+        """Rotation angle, 0-180 degrees."""
+        return float(np.degrees(Rotation.from_matrix(self.rotation).magnitude()))
+
+    def apply(self, points: Floats) -> Floats:
+        """Move (n, 3) points."""
+        return np.asarray(points) @ self.rotation.T + self.translation
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+
+@dataclass(frozen=True)
+class SkeletonGraph:
+    """The numbered graph of sec. III-B.
+
+    Attributes:
+        nodes: (m, 3) mm.
+        edges: (e, 2) directed edges ``from, to``; a bidirectional link is two rows.
+        parts: (m,) int64 of `Part`.
+    """
+
+    nodes: Floats
+    edges: Ints
+    parts: Ints
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", as_points(self.nodes, "graph nodes"))
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def with_nodes(self, nodes: Floats) -> SkeletonGraph:
+        """The same topology at other positions."""
+        return replace(self, nodes=nodes)
+
+    def hops(self, *, directed: bool) -> Ints:
+        """(m, m) graph distance in edges from row to column node; unreachable pairs are ``len(self)``."""
+        m = len(self)
+        weights = csr_array((np.ones(len(self.edges)), (self.edges[:, 0], self.edges[:, 1])), shape=(m, m))
+        lengths = shortest_path(weights, directed=directed, unweighted=True)
+        return np.where(np.isinf(lengths), m, lengths).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """Waypoints of the scan path (sec. IV-B).
+
+    Attributes:
+        points: (k, 3) mm.
+        labels: one per row, ``"R2-3.1"`` is the first (most medial) of the right side between levels 2 and 3.
+    """
+
+    points: Floats
+    labels: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", as_points(self.points, "waypoints"))
+        if len(self.labels) != len(self.points):
+            raise StudyError(f"expected one label per waypoint ({len(self.points)}), got {len(self.labels)}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What every method returns.
+
+    Attributes:
+        source: (n, 3) mm, the CT points as given.
+        warped: (n, 3) mm, row i is ``source[i]`` in the target (US) frame.
+        T_us_ct: the rigid part: the whole answer of a rigid method, the coarse alignment of a non-rigid one.
+        converged: False when the iteration limit ended the run.
+        n_iterations: iterations (epochs) run.
+        stop_reason: why it stopped, in words.
+        history: one figure of progress per iteration; what it is depends on the method.
+        seconds: wall time.
+        method: name in ``METHODS``.
+        warnings: what a careful reader should know about this result.
+    """
+
+    source: Floats
+    warped: Floats
+    T_us_ct: RigidTransform
+    converged: bool
+    n_iterations: int
+    stop_reason: str
+    history: tuple[float, ...] = ()
+    seconds: float = 0.0
+    method: str = ""
+    warnings: tuple[str, ...] = ()
+    extras: Mapping[str, Any] = field(default_factory=dict)
+
+    def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
+        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits (sec. III-D).
+
+        Raises:
+            StudyError: fewer than 3 cloud points within ``radius_mm`` of a waypoint.
+        """
+        from study.path import transfer_path  # the verb lives with its section; the noun offers it
+
+        return transfer_path(self.source, self.warped, waypoints, radius_mm=radius_mm)
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A registration method: a frozen dataclass of its parameters plus one verb."""
+
+    name: ClassVar[str]
+
+    def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
+        """Register labelled, coarsely aligned clouds: ``warped`` row i is source point i in the target frame."""
+        ...
+
+
