@@ -228,6 +228,98 @@ class RigidTransform:
 
 
 @dataclass(frozen=True)
+class ChestFrame:
+    """Where the sternum lies in a cloud: the frame in which the template is drawn.
+
+    Attributes:
+        origin: (3,) mm, centre of the sternum.
+        left, up, front: (3,) unit vectors, orthogonal; left is the patient's, so left × up = front.
+        length_mm, width_mm: sternum along ``up`` and ``left``.
+        reach_mm: how far each cartilage extends from the sternum's edge along ``left``, by part.
+    """
+
+    origin: Floats
+    left: Floats
+    up: Floats
+    front: Floats
+    length_mm: float
+    width_mm: float
+    reach_mm: Mapping[Part, float]
+
+    @property
+    def T_cloud_chest(self) -> RigidTransform:
+        """Chest coordinates (left, up, front) to the cloud's own frame."""
+        return RigidTransform(np.column_stack([self.left, self.up, self.front]), self.origin)
+
+
+@dataclass(frozen=True)
+class Volume:
+    """An image on a regular grid whose axes run closest to R, A and S.
+
+    Attributes:
+        values: (ni, nj, nk) read-only; Hounsfield units, label ids or `Part` values.
+        spacing_mm: (3,) mm between voxel centres along i, j, k.
+        T_ras_index: maps ``index * spacing_mm`` to RAS+ mm; its translation is the centre of voxel (0, 0, 0).
+        name: what the image is, for messages: ``"ct:lidc-0001"``.
+
+    Raises:
+        StudyError: not three axes of at least two voxels, or a spacing that is not finite and positive.
+    """
+
+    values: NDArray[Any]
+    spacing_mm: Floats
+    T_ras_index: RigidTransform = field(default_factory=RigidTransform)
+    name: str = "volume"
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values).view()
+        spacing = np.array(self.spacing_mm, dtype=np.float64)
+        if values.ndim != 3 or min(values.shape) < 2:
+            raise StudyError(f"{self.name}: expected a 3-D image, got an array of shape {values.shape}; give a whole series")
+        if spacing.shape != (3,) or not np.isfinite(spacing).all() or (spacing <= 0).any():
+            raise StudyError(f"{self.name}: expected three positive spacings in mm, got {spacing}; check the header")
+        values.flags.writeable = False
+        spacing.flags.writeable = False
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "spacing_mm", spacing)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels along i, j, k."""
+        ni, nj, nk = self.values.shape
+        return ni, nj, nk
+
+    @property
+    def affine(self) -> Floats:
+        """(4, 4) from voxel index to RAS+ mm."""
+        return self.T_ras_index.matrix @ np.diag([*self.spacing_mm, 1.0])
+
+    def to_mm(self, indices: ArrayLike) -> Floats:
+        """RAS+ mm (n, 3) of voxel indices (n, 3), which may be fractional."""
+        return self.T_ras_index.apply(np.asarray(indices, dtype=np.float64) * self.spacing_mm)
+
+    def to_index(self, points: ArrayLike) -> Floats:
+        """Fractional voxel indices (n, 3) of RAS+ points (n, 3) mm."""
+        return self.T_ras_index.inverse.apply(np.asarray(points, dtype=np.float64)) / self.spacing_mm
+
+    def with_values(self, values: NDArray[Any]) -> Volume:
+        """Other values on the same grid."""
+        if values.shape != self.values.shape:
+            raise StudyError(f"{self.name}: expected values of shape {self.shape}, got {values.shape}")
+        return replace(self, values=values)
+
+    def crop(self, low: ArrayLike, high: ArrayLike) -> Volume:
+        """The box of voxel indices ``low <= index < high``, clipped to the grid; a view, in the same frame."""
+        start = np.clip(np.asarray(low, dtype=np.int64), 0, self.shape)
+        stop = np.clip(np.asarray(high, dtype=np.int64), 0, self.shape)
+        if (stop - start < 2).any():
+            raise StudyError(f"{self.name}: expected a box of at least 2 voxels a side, got {start} to {stop}")
+        box = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
+        moved = RigidTransform(self.T_ras_index.rotation, self.to_mm(start[None])[0])
+        return replace(self, values=self.values[box], T_ras_index=moved)
+
+
+@dataclass(frozen=True)
 class SkeletonGraph:
     """The numbered graph of sec. III-B.
 
