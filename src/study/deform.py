@@ -1,0 +1,328 @@
+"""Smooth invertible deformations of the chest, so that the truth of a registration is known.
+
+A `Deformation` is a chain of steps, each of which is invertible by construction: an affine map, a roll of the plane
+onto the rib cage, or a displacement along one axis that never folds. Nothing is interpolated, so ``inverse`` undoes
+``apply`` to rounding, and every Jacobian determinant is positive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
+
+from study.errors import StudyError
+from study.geometry import fit_rigid
+from study.types import Floats, RigidTransform, as_points
+
+INVERSE_TOLERANCE_MM = 1e-9
+MAX_SLOPE = 0.9  # a displacement along an axis that changes by less than 1 mm per mm cannot fold
+N_CALIBRATION = 1500  # points that decide the size of a planted deformation; more do not move its third digit
+
+
+class Step(Protocol):
+    """One invertible map of space."""
+
+    def apply(self, points: Floats) -> Floats:
+        """Map (n, 3) mm."""
+        ...
+
+    def inverse(self, points: Floats) -> Floats:
+        """Undo `apply`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Affine:
+    """``origin + matrix (p - origin) + shift``; the determinant must be positive."""
+
+    matrix: Floats  # (3, 3)
+    origin: Floats  # (3,) mm
+    shift: Floats  # (3,) mm
+
+    def __post_init__(self) -> None:
+        if not np.linalg.det(self.matrix) > 0:
+            raise StudyError(
+                f"expected a matrix of positive determinant, got {np.linalg.det(self.matrix):.3g}; "
+                "a mirrored anatomy is not a deformation"
+            )
+
+    @classmethod
+    def stretch(cls, factors: Floats, origin: Floats) -> Affine:
+        """Stretch by three positive factors about ``origin``."""
+        return cls(np.diag(factors), np.asarray(origin, float), np.zeros(3))
+
+    @classmethod
+    def motion(cls, angles_deg: Floats, shift: Floats, origin: Floats) -> Affine:
+        """A rigid motion: turns about x, y, z through ``origin``, then ``shift``."""
+        matrix = Rotation.from_euler("xyz", angles_deg, degrees=True).as_matrix()
+        return cls(matrix, np.asarray(origin, float), np.asarray(shift, float))
+
+    def apply(self, points: Floats) -> Floats:
+        """Map (n, 3) mm."""
+        return (points - self.origin) @ self.matrix.T + self.origin + self.shift
+
+    def inverse(self, points: Floats) -> Floats:
+        """Undo `apply`."""
+        return np.linalg.solve(self.matrix, (points - self.origin - self.shift).T).T + self.origin
+
+
+@dataclass(frozen=True)
+class Roll:
+    """Roll the plane y = 0 onto a rib cage: x becomes arc length on a circle that widens towards the feet.
+
+    The line x = 0 stays in place; the radius is ``radius_mm * exp(-taper * z)``.
+    """
+
+    radius_mm: float
+    taper: float  # 1/mm
+
+    def _radius(self, z: Floats) -> Floats:
+        return self.radius_mm * np.exp(-self.taper * z)
+
+    def apply(self, points: Floats) -> Floats:
+        """Map (n, 3) mm; points must lie in front of the axis of the circle, y > -radius."""
+        x, y, z = points.T
+        radius = self._radius(z)
+        return np.column_stack([(radius + y) * np.sin(x / radius), (radius + y) * np.cos(x / radius) - radius, z])
+
+    def inverse(self, points: Floats) -> Floats:
+        """Undo `apply`."""
+        x, y, z = points.T
+        radius = self._radius(z)
+        return np.column_stack([radius * np.arctan2(x, radius + y), np.hypot(x, radius + y) - radius, z])
+
+
+def _undo_displacement(points: Floats, axis: int, displacement: Callable[[Floats], tuple[Floats, Floats]]) -> Floats:
+    """Solve ``q + displacement(q) = points`` along one axis by Newton's method."""
+    moved = points.copy()
+    for _ in range(60):
+        offset, slope = displacement(moved)
+        residual = moved[:, axis] + offset - points[:, axis]
+        moved[:, axis] -= residual / (1 + slope)
+        if np.abs(residual).max(initial=0.0) < INVERSE_TOLERANCE_MM:
+            return moved
+    raise StudyError("expected an invertible displacement, got one that Newton's method cannot undo; lower its size")
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Displace ``axis`` by ``slope`` mm per mm of ``along`` beyond ``start_mm``, starting over ``blend_mm``.
+
+    Along its own axis it is a stretch of one half of space; along another it is a bend with a knee.
+    ``direction`` -1 is the half below ``start_mm``.
+    """
+
+    axis: int
+    along: int
+    slope: float
+    start_mm: float
+    blend_mm: float
+    direction: int = 1
+
+    def __post_init__(self) -> None:
+        # A stretch of one half has this derivative: 1 + direction * slope, which must stay well above 0.
+        if self.axis == self.along and self.direction * self.slope < -MAX_SLOPE:
+            raise StudyError(f"expected a slope that does not fold space, got {self.slope:g}; stay above -{MAX_SLOPE}")
+
+    def _displacement(self, points: Floats) -> tuple[Floats, Floats]:
+        t = self.direction * (points[:, self.along] - self.start_mm) / self.blend_mm
+        own = self.direction * self.slope * expit(t) if self.axis == self.along else np.zeros(len(points))
+        return self.slope * self.blend_mm * np.logaddexp(0.0, t), own
+
+    def apply(self, points: Floats) -> Floats:
+        """Map (n, 3) mm."""
+        moved = points.copy()
+        moved[:, self.axis] += self._displacement(points)[0]
+        return moved
+
+    def inverse(self, points: Floats) -> Floats:
+        """Undo `apply`."""
+        return _undo_displacement(points, self.axis, self._displacement)
+
+
+@dataclass(frozen=True)
+class Bumps:
+    """Displace ``axis`` by a sum of Gaussian bumps; an infinite width makes a bump a band or a wall.
+
+    Attributes:
+        axis: 0, 1 or 2, the axis along which points move.
+        centres: (k, 3) mm.
+        widths: (k, 3) mm, standard deviations; ``inf`` where a bump does not depend on an axis.
+        heights: (k,) mm.
+    """
+
+    axis: int
+    centres: Floats
+    widths: Floats
+    heights: Floats
+
+    def __post_init__(self) -> None:
+        # Steepest slope of exp(-t^2/2) is exp(-1/2); neighbours may add up, so their sum is the safe bound.
+        steepest = np.exp(-0.5) * np.abs(self.heights / self.widths[:, self.axis]).sum()
+        if steepest > MAX_SLOPE:
+            raise StudyError(
+                f"expected bumps that cannot fold space (summed slope at most {MAX_SLOPE}), got {steepest:.2f}; "
+                "lower the size or widen the bumps"
+            )
+
+    def _displacement(self, points: Floats) -> tuple[Floats, Floats]:
+        offset, slope = np.zeros(len(points)), np.zeros(len(points))
+        for centre, width, height in zip(self.centres, self.widths, self.heights, strict=True):
+            used = np.flatnonzero(np.isfinite(width))
+            t = (points[:, used] - centre[used]) / width[used]
+            bump = height * np.exp(-0.5 * np.einsum("ni,ni->n", t, t))
+            offset += bump
+            if self.axis in used:
+                slope -= bump * t[:, list(used).index(self.axis)] / width[self.axis]
+        return offset, slope
+
+    def apply(self, points: Floats) -> Floats:
+        """Map (n, 3) mm."""
+        moved = points.copy()
+        moved[:, self.axis] += self._displacement(points)[0]
+        return moved
+
+    def inverse(self, points: Floats) -> Floats:
+        """Undo `apply`."""
+        return _undo_displacement(points, self.axis, self._displacement)
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """A chain of steps, first one first."""
+
+    steps: tuple[Step, ...] = ()
+
+    def apply(self, points: Floats) -> Floats:
+        """Map (n, 3) mm."""
+        moved = np.array(points, dtype=np.float64)
+        for step in self.steps:
+            moved = step.apply(moved)
+        return moved
+
+    def inverse(self, points: Floats) -> Floats:
+        """Undo `apply`, (n, 3) mm, to about 1e-9 mm."""
+        moved = np.array(points, dtype=np.float64)
+        for step in reversed(self.steps):
+            moved = step.inverse(moved)
+        return moved
+
+    def then(self, *steps: Step) -> Deformation:
+        """This deformation followed by more steps."""
+        return Deformation((*self.steps, *steps))
+
+    def jacobian_determinant(self, points: Floats, step_mm: float = 1e-3) -> Floats:
+        """Local volume change (n,) at (n, 3) mm by central differences; positive where nothing folds."""
+        points = np.asarray(points, dtype=np.float64)
+        columns = [
+            (self.apply(points + offset) - self.apply(points - offset)) / (2 * step_mm) for offset in step_mm * np.eye(3)
+        ]
+        return np.linalg.det(np.stack(columns, axis=-1))
+
+
+def breathing(centre: Floats, rng: np.random.Generator) -> tuple[Step, ...]:
+    """Quiet breathing: the front of the chest moves 3-5 mm up and forward and 1-2 mm outwards on each side.
+
+    Args:
+        centre: (3,) mm, on the sternum between levels 3 and 5, where the motion is largest.
+    """
+    up, forward, outward = rng.uniform([3, 3, 1], [5, 5, 2])
+    x, y, z = centre
+    return (
+        _bump(2, (x, y, z - 10), (np.inf, np.inf, 70), up),
+        _bump(1, (x, y, z - 10), (90, np.inf, 70), forward),
+        Bumps(
+            0,
+            np.array([[x + 70, y, z - 10], [x - 70, y, z - 10]]),
+            np.array([[45, np.inf, 70], [45, np.inf, 70]]),
+            outward * np.array([1.0, -1.0]),
+        ),
+    )
+
+
+def rib_bending(
+    centre: Floats, levels_z: Floats, size_mm: float, band_mm: float, rng: np.random.Generator
+) -> tuple[Step, ...]:
+    """Bend each rib on its own, up or down and in or out, on each side.
+
+    Args:
+        centre: (3,) mm, the middle of the sternum.
+        levels_z: (k,) mm, heights of the ribs at ``centre`` ± 55 mm.
+        size_mm: standard deviation of the displacement at the middle of the bend, cut at two of them.
+        band_mm: standard deviation of a band along z; about half the distance of two ribs.
+    """
+    sides = np.tile([55.0, -55.0], len(levels_z))
+    centres = np.column_stack([centre[0] + sides, np.full(len(sides), centre[1]), np.repeat(levels_z, 2)])
+    heights = size_mm * np.clip(rng.normal(size=(2, len(sides))), -2, 2)
+    # Bands to the front or back may be narrow, as y does not fold along z; those along z must not fold.
+    out = Bumps(1, centres, np.tile([30.0, np.inf, band_mm], (len(sides), 1)), heights[0])
+    up = tuple(
+        _bump(2, middle, (30.0, np.inf, 1.6 * band_mm), height)
+        for middle, height in zip(centres, heights[1], strict=True)
+    )
+    return (out, *up)
+
+
+def planted_deformation(points: Floats, size_mm: float, rng: np.random.Generator) -> Deformation:
+    """A smooth deformation of a real anatomy, of the kinds and sizes found between people.
+
+    Stretch, bend of the sternum, bulge of the chest, breathing and rib-by-rib bending, the lot scaled so that what
+    remains after the best rigid alignment is ``size_mm`` on average. Breathing keeps its published size.
+
+    Args:
+        points: (n, 3) mm, RAS+, the surface of sternum and cartilages 2-5.
+        size_mm: mean distance of ``points`` from their deformed places after a rigid fit; people differ by 5-10 mm.
+
+    Raises:
+        StudyError: a size that breathing alone exceeds, or that would fold space.
+    """
+    points = as_points(points, "points to deform", at_least=50)
+    sample = points[rng.permutation(len(points))[:N_CALIBRATION]]
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    centre = np.median(points, axis=0)
+    centre[0] = (low[0] + high[0]) / 2
+    levels_z = np.linspace(low[2], high[2], 4)
+    stretch = 0.1 * np.clip(rng.normal(size=3), -1.5, 1.5)
+    bend, bulge = rng.uniform(4.0, 9.0, 2) * rng.choice([-1, 1], 2)
+    seed = int(rng.integers(2**63))
+
+    def deformation(scale: float) -> Deformation:
+        replay = np.random.default_rng(seed)  # the same ribs and breath at every scale
+        return Deformation(
+            (
+                Affine.stretch(np.exp(scale * stretch), centre),
+                _bump(1, (centre[0], centre[1], centre[2] - 20), (np.inf, np.inf, 45), scale * bend),
+                _bump(1, (centre[0], centre[1], centre[2]), (50, np.inf, np.inf), scale * bulge),
+                *rib_bending(centre, levels_z, 2.5 * scale, 16.0, replay),
+                *breathing(centre, replay),
+            )
+        )
+
+    def excess(scale: float) -> float:
+        return residual_mm(sample, deformation(scale).apply(sample)) - size_mm
+
+    if not np.isfinite(size_mm) or excess(0.0) > 0:
+        raise StudyError(
+            f"expected a size above the {excess(0.0) + size_mm:.2f} mm that breathing alone makes, got {size_mm:g}; "
+            "people differ by 5-10 mm"
+        )
+    scale = 1.0
+    while excess(scale) < 0:
+        scale *= 1.5  # a scale that folds space raises in its step
+    return deformation(float(brentq(excess, 0.0, scale, xtol=1e-4)))
+
+
+def residual_mm(source: Floats, target: Floats) -> float:
+    """Mean distance of paired (n, 3) points after the best rigid alignment."""
+    fitted: RigidTransform = fit_rigid(source, target)
+    return float(np.linalg.norm(fitted.apply(source) - target, axis=1).mean())
+
+
+def _bump(axis: int, centre: tuple[float, ...] | Floats, widths: tuple[float, ...], height: float) -> Bumps:
+    return Bumps(axis, np.array([centre], dtype=float), np.array([widths], dtype=float), np.array([float(height)]))
