@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import binary_closing
 from scipy.spatial import KDTree
 
 from study.errors import StudyError
-from study.types import Floats, Ints, RigidTransform
+from study.types import Bools, Floats, Ints, RigidTransform
 
 
 def fit_rigid(source: Floats, target: Floats, weights: Floats | None = None) -> RigidTransform:
@@ -63,3 +64,52 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     axes = axes[:, ::-1].T
     axes[2] = np.cross(axes[0], axes[1])
     return centre, axes
+
+
+def pixelise(points: Floats, pixel_mm: float, pad: int = 0) -> tuple[Bools, Ints, Floats]:
+    """Occupancy image of 2-D points (``I_b`` of Eq. 1).
+
+    Args:
+        points: (n, 2) mm.
+        pixel_mm: edge of a pixel.
+        pad: empty pixels added on every side.
+
+    Returns:
+        image (rows, columns) of bool with axis 0 along x and axis 1 along y; the pixel (n, 2) of each point;
+        the position (2,) mm of the centre of pixel (0, 0).
+    """
+    low = np.floor(points.min(axis=0) / pixel_mm) - pad
+    pixels = (np.floor(points / pixel_mm) - low).astype(np.int64)
+    image = np.zeros(pixels.max(axis=0) + 1 + pad, dtype=bool)
+    image[pixels[:, 0], pixels[:, 1]] = True
+    return image, pixels, (low + 0.5) * pixel_mm
+
+
+def close_gaps(image: Bools, pixels: int) -> Bools:
+    """Fill holes up to ``2 * pixels`` wide, such as those between the samples of a sparse cloud."""
+    if pixels < 1:
+        return image
+    disc = np.hypot(*np.mgrid[-pixels : pixels + 1, -pixels : pixels + 1]) <= pixels + 0.5
+    return binary_closing(np.pad(image, pixels), disc)[pixels:-pixels, pixels:-pixels]
+
+
+def sample_spacing_mm(points: Floats) -> float:
+    """Median distance from a point to its nearest neighbour, mm."""
+    distances, _ = KDTree(points).query(points, k=[2])
+    return float(np.median(distances))
+
+
+def farthest_points(points: Floats, n: int) -> Ints:
+    """Indices (min(n, len),) of points spread evenly over (k, 3) ``points``, whatever their density.
+
+    Each is the one farthest from those before it, the first the one farthest from the centroid: no draw, and the
+    same rows in any rigid pose.
+    """
+    gap = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    chosen = np.empty(min(n, len(points)), dtype=np.int64)
+    for k in range(len(chosen)):
+        chosen[k] = np.argmax(gap)
+        offset = points - points[chosen[k]]
+        distance = np.sqrt(np.einsum("ni,ni->n", offset, offset))
+        gap = distance if k == 0 else np.minimum(gap, distance)
+    return chosen
