@@ -26,6 +26,7 @@ SIDES = ("right", "left")
 JUNCTION_GAP_MM = 5.0  # label sets leave up to two voxels between a rib's end and its cartilage
 STERNUM_GAP_MM = 15.0  # beyond this a cartilage does not reach the sternum: it is cut off or mislabelled
 ATTACHMENT_MM = 3.0  # a cartilage's sternal end: its voxels this close to the nearest one
+DISC_TO_LATTICE = 0.79  # mean gap of Open3D's Poisson discs over that of a triangular lattice of as many points
 MIN_CONTACT = 10  # voxels; fewer is a stray touch of two labels, not a junction
 
 
@@ -297,7 +298,7 @@ def sample_cloud(mesh: Mesh, n_points: int, rng: np.random.Generator) -> PointCl
 
 
 def points_for_spacing(mesh: Mesh, spacing_mm: float) -> int:
-    """How many Poisson-disc points lie about ``spacing_mm`` apart: as a triangular lattice of that spacing.
+    """How many Poisson-disc points have their nearest neighbour ``spacing_mm`` away on average.
 
     Raises:
         StudyError: a spacing that is not positive.
@@ -306,4 +307,4 @@ def points_for_spacing(mesh: Mesh, spacing_mm: float) -> int:
         raise StudyError(f"expected a positive spacing, got {spacing_mm} mm")
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    return int(np.ceil(area / (np.sqrt(3) / 2 * spacing_mm**2)))
+    return int(np.ceil(area / (np.sqrt(3) / 2 * (spacing_mm / DISC_TO_LATTICE) ** 2)))

@@ -7,11 +7,16 @@ so the headers are checked before the pixels are read.
 
 from __future__ import annotations
 
+import gzip
+import math
 import os
 import re
+import struct
 import tempfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import SimpleITK as sitk
@@ -25,6 +30,7 @@ LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0])
 SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 ORTHOGONAL_ATOL = 1e-3  # direction cosines are stored with 4-6 digits
 TILT_MM = 0.1  # per slice: DICOM positions are rounded to 0.001 mm, a tilt of 1 degree shifts 1 mm slices by 0.02 mm
+NIFTI1_BYTES = 348  # header size, and its first field
 STEP_RTOL = 0.05  # slice positions of a real series vary by rounding; a missing slice doubles one
 
 
@@ -196,20 +202,59 @@ def _check_header(path: Path, name: str) -> None:
             raise StudyError(f"{name}: expected ElementSpacing in the MetaImage header, got none; export it again")
         if not ({"transformmatrix", "rotation", "orientation"} & fields.keys()):
             raise StudyError(f"{name}: expected TransformMatrix in the MetaImage header, got an unknown orientation")
+    else:
+        _check_nifti(path, name)
     try:
         reader.ReadImageInformation()
     except RuntimeError as error:
         raise _explain(error, name) from error
-    if reader.HasMetaDataKey("qform_code") and reader.HasMetaDataKey("sform_code"):
-        codes = reader.GetMetaData("qform_code"), reader.GetMetaData("sform_code")
-        if codes == ("0", "0"):
+    _check_size(reader, path, name)
+
+
+def _check_nifti(path: Path, name: str) -> None:
+    """ITK replaces a zero spacing by 1 mm and missing voxels by zeros, without a word."""
+    unpack = gzip.open if path.name.lower().endswith(".gz") else open
+    with unpack(path, "rb") as stream:
+        try:
+            header = stream.read(NIFTI1_BYTES)
+        except (OSError, EOFError) as error:
+            raise _explain(error, name) from error
+        order = "<" if header[:4] == NIFTI1_BYTES.to_bytes(4, "little") else ">"
+        if len(header) < NIFTI1_BYTES or struct.unpack_from(f"{order}i", header)[0] != NIFTI1_BYTES:
+            if header[:4] in ((540).to_bytes(4, "little"), (540).to_bytes(4, "big")):
+                return  # NIfTI-2, with another layout
+            raise StudyError(f"{name}: expected a NIfTI header, got a truncated or damaged file; fetch it again")
+        dims = struct.unpack_from(f"{order}8h", header, 40)
+        bits = struct.unpack_from(f"{order}h", header, 72)[0]
+        pixdim = struct.unpack_from(f"{order}8f", header, 76)
+        first = int(struct.unpack_from(f"{order}f", header, 108)[0])
+        codes = struct.unpack_from(f"{order}2h", header, 252)
+        if codes == (0, 0):
             raise StudyError(
                 f"{name}: expected a qform or sform in the NIfTI header, got an unknown orientation "
                 "(both codes are 0); export it again with its affine"
             )
-        if any(abs(float(reader.GetMetaData(f"pixdim[{axis}]"))) < 1e-6 for axis in (1, 2, 3)):
-            raise StudyError(f"{name}: expected a positive voxel spacing, got pixdim 0; repair the header")
-    _check_size(reader, path, name)
+        if min(abs(step) for step in pixdim[1:4]) < 1e-6:
+            raise StudyError(f"{name}: expected a positive voxel spacing, got pixdim {pixdim[1:4]}; repair the header")
+        expected = first + math.prod(max(n, 1) for n in dims[1 : dims[0] + 1]) * bits // 8
+        if _stream_bytes(path, stream, expected) < expected:
+            raise StudyError(f"{name}: expected {expected} bytes, got a truncated or damaged file; fetch it again")
+
+
+def _stream_bytes(path: Path, stream: IO[bytes] | gzip.GzipFile, expected: int) -> int:
+    """Length of an open file's content; a gzip file states it in its last 4 bytes, else it is unpacked to count."""
+    if not path.name.lower().endswith(".gz"):
+        return path.stat().st_size
+    with path.open("rb") as packed:
+        packed.seek(-4, os.SEEK_END)
+        if int.from_bytes(packed.read(4), "little") == expected % 2**32:
+            return expected
+    try:
+        while stream.read(1 << 24):
+            pass
+        return stream.tell()
+    except (OSError, EOFError, zlib.error):
+        return 0
 
 
 def _text_header(path: Path, end: str) -> dict[str, str]:
