@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
@@ -22,6 +23,7 @@ from study.types import Floats, RigidTransform, as_points
 
 INVERSE_TOLERANCE_MM = 1e-9
 MAX_SLOPE = 0.9  # a displacement along an axis that changes by less than 1 mm per mm cannot fold
+MAX_SIZE_MM = 20.0  # twice what people differ by
 N_CALIBRATION = 1500  # points that decide the size of a planted deformation; more do not move its third digit
 
 
@@ -86,9 +88,15 @@ class Roll:
         return self.radius_mm * np.exp(-self.taper * z)
 
     def apply(self, points: Floats) -> Floats:
-        """Map (n, 3) mm; points must lie in front of the axis of the circle, y > -radius."""
+        """Map (n, 3) mm.
+
+        Raises:
+            StudyError: points at or behind the axis of the circle, y <= -radius, where the roll is not one to one.
+        """
         x, y, z = points.T
         radius = self._radius(z)
+        if (radius + y).min(initial=1.0) <= 0:
+            raise StudyError(f"expected points in front of the axis of the chest, got y = {y.min():.0f} mm; crop them")
         return np.column_stack([(radius + y) * np.sin(x / radius), (radius + y) * np.cos(x / radius) - radius, z])
 
     def inverse(self, points: Floats) -> Floats:
@@ -171,15 +179,20 @@ class Bumps:
                 "lower the size or widen the bumps"
             )
 
+    @classmethod
+    def one(cls, axis: int, centre: ArrayLike, widths: ArrayLike, height: float) -> Bumps:
+        """A single bump."""
+        return cls(axis, np.array([centre], float), np.array([widths], float), np.array([float(height)]))
+
     def _displacement(self, points: Floats) -> tuple[Floats, Floats]:
         offset, slope = np.zeros(len(points)), np.zeros(len(points))
         for centre, width, height in zip(self.centres, self.widths, self.heights, strict=True):
-            used = np.flatnonzero(np.isfinite(width))
+            used = [axis for axis in range(3) if np.isfinite(width[axis])]
             t = (points[:, used] - centre[used]) / width[used]
             bump = height * np.exp(-0.5 * np.einsum("ni,ni->n", t, t))
             offset += bump
             if self.axis in used:
-                slope -= bump * t[:, list(used).index(self.axis)] / width[self.axis]
+                slope -= bump * t[:, used.index(self.axis)] / width[self.axis]
         return offset, slope
 
     def apply(self, points: Floats) -> Floats:
@@ -221,7 +234,8 @@ class Deformation:
         """Local volume change (n,) at (n, 3) mm by central differences; positive where nothing folds."""
         points = np.asarray(points, dtype=np.float64)
         columns = [
-            (self.apply(points + offset) - self.apply(points - offset)) / (2 * step_mm) for offset in step_mm * np.eye(3)
+            (self.apply(points + offset) - self.apply(points - offset)) / (2 * step_mm)
+            for offset in step_mm * np.eye(3)
         ]
         return np.linalg.det(np.stack(columns, axis=-1))
 
@@ -235,8 +249,8 @@ def breathing(centre: Floats, rng: np.random.Generator) -> tuple[Step, ...]:
     up, forward, outward = rng.uniform([3, 3, 1], [5, 5, 2])
     x, y, z = centre
     return (
-        _bump(2, (x, y, z - 10), (np.inf, np.inf, 70), up),
-        _bump(1, (x, y, z - 10), (90, np.inf, 70), forward),
+        Bumps.one(2, (x, y, z - 10), (np.inf, np.inf, 70), up),
+        Bumps.one(1, (x, y, z - 10), (90, np.inf, 70), forward),
         Bumps(
             0,
             np.array([[x + 70, y, z - 10], [x - 70, y, z - 10]]),
@@ -263,7 +277,7 @@ def rib_bending(
     # Bands to the front or back may be narrow, as y does not fold along z; those along z must not fold.
     out = Bumps(1, centres, np.tile([30.0, np.inf, band_mm], (len(sides), 1)), heights[0])
     up = tuple(
-        _bump(2, middle, (30.0, np.inf, 1.6 * band_mm), height)
+        Bumps.one(2, middle, (30.0, np.inf, 1.6 * band_mm), height)
         for middle, height in zip(centres, heights[1], strict=True)
     )
     return (out, *up)
@@ -280,7 +294,7 @@ def planted_deformation(points: Floats, size_mm: float, rng: np.random.Generator
         size_mm: mean distance of ``points`` from their deformed places after a rigid fit; people differ by 5-10 mm.
 
     Raises:
-        StudyError: a size that breathing alone exceeds, or that would fold space.
+        StudyError: a size that breathing alone exceeds, above 20 mm, or that would fold space.
     """
     points = as_points(points, "points to deform", at_least=50)
     sample = points[rng.permutation(len(points))[:N_CALIBRATION]]
@@ -297,8 +311,8 @@ def planted_deformation(points: Floats, size_mm: float, rng: np.random.Generator
         return Deformation(
             (
                 Affine.stretch(np.exp(scale * stretch), centre),
-                _bump(1, (centre[0], centre[1], centre[2] - 20), (np.inf, np.inf, 45), scale * bend),
-                _bump(1, (centre[0], centre[1], centre[2]), (50, np.inf, np.inf), scale * bulge),
+                Bumps.one(1, (centre[0], centre[1], centre[2] - 20), (np.inf, np.inf, 45), scale * bend),
+                Bumps.one(1, (centre[0], centre[1], centre[2]), (50, np.inf, np.inf), scale * bulge),
                 *rib_bending(centre, levels_z, 2.5 * scale, 16.0, replay),
                 *breathing(centre, replay),
             )
@@ -307,14 +321,15 @@ def planted_deformation(points: Floats, size_mm: float, rng: np.random.Generator
     def excess(scale: float) -> float:
         return residual_mm(sample, deformation(scale).apply(sample)) - size_mm
 
-    if not np.isfinite(size_mm) or excess(0.0) > 0:
+    breath_mm = residual_mm(sample, deformation(0.0).apply(sample))
+    if not breath_mm < size_mm <= MAX_SIZE_MM:
         raise StudyError(
-            f"expected a size above the {excess(0.0) + size_mm:.2f} mm that breathing alone makes, got {size_mm:g}; "
-            "people differ by 5-10 mm"
+            f"expected a size between the {breath_mm:.2f} mm that breathing alone makes and {MAX_SIZE_MM:g} mm, "
+            f"got {size_mm:g}; people differ by 5-10 mm"
         )
     scale = 1.0
     while excess(scale) < 0:
-        scale *= 1.5  # a scale that folds space raises in its step
+        scale *= 1.1  # a scale that folds space raises in its step
     return deformation(float(brentq(excess, 0.0, scale, xtol=1e-4)))
 
 
@@ -322,7 +337,3 @@ def residual_mm(source: Floats, target: Floats) -> float:
     """Mean distance of paired (n, 3) points after the best rigid alignment."""
     fitted: RigidTransform = fit_rigid(source, target)
     return float(np.linalg.norm(fitted.apply(source) - target, axis=1).mean())
-
-
-def _bump(axis: int, centre: tuple[float, ...] | Floats, widths: tuple[float, ...], height: float) -> Bumps:
-    return Bumps(axis, np.array([centre], dtype=float), np.array([widths], dtype=float), np.array([float(height)]))

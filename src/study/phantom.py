@@ -15,14 +15,14 @@ from functools import lru_cache
 from zlib import crc32
 
 import numpy as np
-from scipy.interpolate import CubicSpline, RegularGridInterpolator
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
 from study.deform import Affine, Bumps, Deformation, Ramp, Roll, breathing, rib_bending
 from study.errors import StudyError
-from study.types import CARTILAGES, Floats, Ints, Part, PointCloud, Waypoints
+from study.types import Bools, Floats, Ints, Part, PointCloud, RigidTransform, Volume, Waypoints
 
 SUBJECTS = ("ct1", "ct2", "ct3", "ct4", "ct5", "patient")
 
@@ -35,21 +35,22 @@ MANUBRIUM_MM = ((46.7, 5.1), (51.2, 6.0))
 BODY_MM = ((86.6, 9.7), (102.4, 13.3))
 CARTILAGE_MM = {4: (55.8, 9.8), 5: (70.0, 10.8)}
 STERNAL_ANGLE_DEG = 163.0
+MAX_SD = 1.3  # draws are cut there: different people, no outliers
 
 # The canonical course of the right side's cartilages and ribs on the flat wall, x and z in mm, z = 0 at the sternal
 # angle; the cartilage takes the first `length` mm from the edge of the sternum, bone follows.
 _COURSES: Mapping[int, tuple[float, tuple[tuple[float, float], ...]]] = {
-    1: (30.0, ((20, 34), (34, 38), (48, 43), (64, 50), (78, 58))),
-    2: (40.0, ((14, 0), (32, 1), (56, 4), (82, 12), (108, 24), (128, 36))),
-    3: (47.0, ((14, -29), (36, -31), (62, -32), (90, -26), (116, -14), (134, -3))),
-    4: (56.0, ((14, -54), (34, -60), (56, -65), (74, -65), (102, -56), (136, -37))),
-    5: (70.0, ((14, -75), (34, -84), (56, -97), (72, -104), (86, -103), (112, -92), (142, -72))),
-    6: (92.0, ((12, -90), (26, -101), (44, -115), (66, -129), (84, -136), (98, -136), (122, -127), (146, -111))),
-    7: (125.0, ((8, -98), (18, -112), (34, -130), (58, -150), (84, -165), (104, -170), (126, -163), (146, -150))),
-    8: (40.0, ((68, -158), (82, -176), (98, -190), (116, -197), (140, -190))),
+    1: (28.0, ((20, 34), (34, 37), (48, 44), (62, 57), (74, 72))),
+    2: (40.0, ((12, 0), (32, 1), (54, 5), (78, 17), (102, 36), (122, 54))),
+    3: (47.0, ((12, -28), (36, -30), (60, -28), (86, -14), (112, 8), (134, 28))),
+    4: (56.0, ((12, -52), (34, -59), (54, -62), (72, -58), (98, -40), (124, -16), (144, 4))),
+    5: (70.0, ((12, -73), (32, -84), (50, -95), (66, -100), (80, -97), (104, -82), (130, -57), (148, -39))),
+    6: (92.0, ((12, -90), (26, -102), (44, -116), (62, -127), (80, -133), (94, -131), (118, -116), (146, -89))),
+    7: (125.0, ((8, -98), (18, -111), (34, -130), (58, -152), (84, -166), (102, -167), (126, -154), (148, -135))),
+    8: (45.0, ((68, -159), (82, -177), (100, -189), (116, -191), (140, -177))),
 }
 # Bridges between neighbours: the 5th and 6th meet well beside the sternum, the 8th ends on the 7th.
-_BRIDGES = (((56, -97), (58, -124)), ((66, -129), (68, -157)))
+_BRIDGES = (((58, -98), (60, -126)), ((66, -129), (68, -157)))
 _HALF_WIDTH_MM = {1: 8.0, 2: 7.5, 3: 7.2, 4: 7.2, 5: 7.2, 6: 6.2, 7: 6.0, 8: 5.5}
 _HALF_THICKNESS_MM = 5.0
 _RIB_HALF_MM = (6.5, 4.0)
@@ -57,15 +58,19 @@ _BRIDGE_HALF_MM = (5.0, 4.0)
 
 # Sternum outline: half width over z, from the xiphoid's tip to the jugular notch.
 _STERNUM_Z = (-128, -120, -108, -99, -92, -78, -62, -45, -28, -12, 0, 10, 22, 36, 45, 49)
-_STERNUM_HALF_WIDTH = (3, 5.5, 7, 9.5, 14, 18.5, 19, 17.5, 16, 15, 17, 17.5, 20, 26, 24, 20)
+_STERNUM_HALF_WIDTH = (3, 5.5, 7, 9, 13, 16.5, 17, 16.5, 15, 14.5, 15.5, 16.5, 20, 25, 24, 20)
 _STERNUM_TOP, _STERNUM_BOTTOM, _BODY_BOTTOM = 49.0, -128.0, -95.0
 _STERNUM_HALF_THICKNESS_MM = 6.0
 _EDGE_RADIUS_MM = 3.0
 
-_ROI_LOW = np.array([-150.0, -75.0, -175.0])  # canonical, mm; what a CT of the phantom must show
-_ROI_HIGH = np.array([150.0, 30.0, 70.0])
-_SURFACE_SPACING_MM = 1.25
+# Canonical, mm: the deformations must be invertible in all of ROI, and a CT shows all of VIEW.
+ROI_LOW, ROI_HIGH = (-150.0, -75.0, -175.0), (150.0, 30.0, 75.0)
+_VIEW_LOW, _VIEW_HIGH = (-118.0, -18.0, -158.0), (118.0, 24.0, 58.0)
+_SURFACE_SPACING_MM = 1.75
 _SAMPLE_MM = 0.25  # spacing of centreline samples: the surface ripples by less than 2 µm
+
+_LATTICE_MM = 6.0
+NOISE_HU = 12.0
 
 _BONE, _CARTILAGE = 1, 2
 
@@ -78,31 +83,15 @@ class Subject:
         name: one of `SUBJECTS`.
         seed: the cohort's seed.
         phi: from the flat canonical wall to the subject's RAS+ frame, mm.
+        fat_mm: thickness of the fat under the skin.
+        cartilage_hu: mean of the cartilage; it calcifies with age.
     """
 
     name: str
     seed: int
     phi: Deformation
     fat_mm: float
-    calcification: float
-
-
-@dataclass(frozen=True)
-class PhantomCT:
-    """A CT of a subject and its labels.
-
-    Attributes:
-        hu: (i, j, k) int16 Hounsfield units; i, j, k run to R, A, S.
-        labels: (i, j, k) uint8, ids as in the open CT's masks: 116 sternum, 118 costal cartilages, 92-103 left and
-            104-115 right ribs.
-        affine: (4, 4), voxel index to RAS+ mm.
-        spacing_mm: (3,) mm.
-    """
-
-    hu: np.ndarray
-    labels: np.ndarray
-    affine: Floats
-    spacing_mm: Floats
+    cartilage_hu: float
 
 
 # ---------------------------------------------------------------------------------------------- canonical anatomy
@@ -110,7 +99,7 @@ class PhantomCT:
 
 @dataclass(frozen=True)
 class _Lines:
-    """Samples of all centrelines on the flat wall, in one tree."""
+    """Samples of all centrelines on the flat wall."""
 
     xz: Floats  # (n, 2) mm
     tangent: Floats  # (n, 2)
@@ -119,7 +108,7 @@ class _Lines:
     level: Ints  # (n,) 1-8, 0 for a bridge
     side: Ints  # (n,) +1 right, -1 left
     tissue: Ints  # (n,)
-    tree: KDTree
+    trees: tuple[tuple[int, KDTree], ...]  # first row and tree of the ribs, then of the bridges between them
 
 
 def _course(knots: tuple[tuple[float, float], ...]) -> tuple[Floats, Floats, Floats]:
@@ -149,18 +138,20 @@ def _lines() -> _Lines:
         xz, tangent, arc = _course(knots)
         half = np.broadcast_to(_BRIDGE_HALF_MM, xz.shape)
         rows.append((xz, tangent, arc, half, np.zeros(len(arc)), np.full(len(arc), _CARTILAGE)))
-    xz, tangent, arc, half, level, tissue = (np.concatenate(column) for column in zip(*rows, strict=True))
+    xz, tangent, arc, half, levels, tissue = (np.concatenate(column) for column in zip(*rows, strict=True))
     mirror = np.array([-1.0, 1.0])
     both = np.concatenate([xz, xz * mirror])
+    order = np.argsort(np.tile(levels, 2) == 0, kind="stable")  # ribs, then bridges
+    n_ribs = int(2 * np.count_nonzero(levels))
     return _Lines(
-        xz=both,
-        tangent=np.concatenate([tangent, tangent * mirror]),
-        arc=np.tile(arc, 2),
-        half=np.tile(half, (2, 1)),
-        level=np.tile(level, 2).astype(np.int64),
-        side=np.repeat([1, -1], len(arc)),
-        tissue=np.tile(tissue, 2).astype(np.int64),
-        tree=KDTree(both),
+        xz=both[order],
+        tangent=np.concatenate([tangent, tangent * mirror])[order],
+        arc=np.tile(arc, 2)[order],
+        half=np.tile(half, (2, 1))[order],
+        level=np.tile(levels, 2).astype(np.int64)[order],
+        side=np.repeat([1, -1], len(arc))[order],
+        tissue=np.tile(tissue, 2).astype(np.int64)[order],
+        trees=((0, KDTree(both[order][:n_ribs])), (n_ribs, KDTree(both[order][n_ribs:]))),
     )
 
 
@@ -176,12 +167,11 @@ def _sternum_half_width(z: Floats) -> Floats:
 @lru_cache(maxsize=1)
 def _sternum_edge() -> KDTree:
     z = np.arange(_STERNUM_BOTTOM, _STERNUM_TOP, _SAMPLE_MM)
-    side = np.column_stack([_sternum_half_width(z), z])
-    ends = [
-        np.column_stack([(x := np.arange(0, _sternum_half_width(np.array([end]))[0], _SAMPLE_MM)), np.full(len(x), end)])
-        for end in (_STERNUM_BOTTOM, _STERNUM_TOP)
-    ]
-    return KDTree(np.concatenate([side, *ends]))
+    edge = [np.column_stack([_sternum_half_width(z), z])]
+    for end in (_STERNUM_BOTTOM, _STERNUM_TOP):
+        x = np.arange(0, _sternum_half_width(np.array([end]))[0], _SAMPLE_MM)
+        edge.append(np.column_stack([x, np.full(len(x), end)]))
+    return KDTree(np.concatenate(edge))
 
 
 def _sternum_distance(points: Floats) -> Floats:
@@ -195,10 +185,17 @@ def _sternum_distance(points: Floats) -> Floats:
 
 def _tube_distance(points: Floats) -> tuple[Floats, Ints]:
     """Signed distance (n,) mm to the nearest flattened tube, and the index (n,) of its nearest centreline sample."""
-    lines = _lines()
     plane = points[:, [0, 2]]
-    _, index = lines.tree.query(plane)
-    offset = plane - lines.xz[index]
+    ribs, bridges = (first + tree.query(plane)[1] for first, tree in _lines().trees)
+    to_rib, to_bridge = _ellipse_distance(points, ribs), _ellipse_distance(points, bridges)
+    is_rib = to_rib <= to_bridge
+    return np.where(is_rib, to_rib, to_bridge), np.where(is_rib, ribs, bridges)
+
+
+def _ellipse_distance(points: Floats, index: Ints) -> Floats:
+    """Signed distance (n,) mm to the tube around the centreline sample ``index`` (n,); exact on the surface."""
+    lines = _lines()
+    offset = points[:, [0, 2]] - lines.xz[index]
     along = np.abs(np.einsum("ni,ni->n", offset, lines.tangent[index]))
     across = np.sqrt(np.maximum(np.einsum("ni,ni->n", offset, offset) - along**2, 0))
     # Between two samples only the distance across counts; beyond the last one the end is round.
@@ -206,8 +203,8 @@ def _tube_distance(points: Floats) -> tuple[Floats, Ints]:
     half_width, half_thickness = lines.half[index].T
     scaled = np.hypot(across / half_width, points[:, 1] / half_thickness)
     slope = np.hypot(across / half_width**2, points[:, 1] / half_thickness**2)
-    # First-order distance to the ellipse, exact on it; at its very centre the slope vanishes.
-    return scaled * (scaled - 1) / np.maximum(slope, 1e-6) + np.where(scaled < 1e-6, -half_thickness, 0), index
+    # First-order distance to the ellipse; at its very centre the slope vanishes.
+    return scaled * (scaled - 1) / np.maximum(slope, 1e-6) + np.where(scaled < 1e-6, -half_thickness, 0)
 
 
 def _distance(points: Floats) -> Floats:
@@ -278,7 +275,8 @@ def _surface() -> _Surface:
 def draw_subject(name: str, seed: int) -> Subject:
     """Draw a subject of the cohort; the same ``name`` and ``seed`` give the same person.
 
-    Lengths of manubrium, body and the 4th and 5th cartilage are drawn from the published means and SDs.
+    Lengths of manubrium, body and the 4th and 5th cartilage are drawn from the published means and SDs, cut at 1.3 of
+    them; the other lengths share their stretch.
 
     Raises:
         StudyError: a name that is not in `SUBJECTS`.
@@ -288,62 +286,68 @@ def draw_subject(name: str, seed: int) -> Subject:
     rng = np.random.default_rng([seed, crc32(name.encode())])
 
     def normal(mean: float, sd: float) -> float:
-        return mean + sd * float(np.clip(rng.normal(), -1.8, 1.8))
+        return mean + sd * float(np.clip(rng.normal(), -MAX_SD, MAX_SD))
 
     sex = int(rng.integers(2))
-    body = normal(*BODY_MM[sex]) / -_BODY_BOTTOM
-    manubrium = normal(*MANUBRIUM_MM[sex]) / _STERNUM_TOP
-    width = normal(0.96 + 0.08 * sex, 0.06)
-    length4, length5 = (normal(*CARTILAGE_MM[level]) / _COURSES[level][0] for level in (4, 5))
+    lean_deg = 180 - normal(STERNAL_ANGLE_DEG, 4.0)
+    middle = np.array([0.0, 0.0, -40.0])
     steps = (
-        *_flat_stretch(manubrium, body, width, 0.5 * (length4 + length5), length5 - length4, rng),
-        *rib_bending(np.array([0.0, 0.0, -40.0]), np.array([2.0, -31.0, -62.0, -98.0]), 2.2, 14.0, rng),
+        *_flat_stretch(
+            manubrium=normal(*MANUBRIUM_MM[sex]) / _STERNUM_TOP * np.cos(np.radians(lean_deg)),
+            body=normal(*BODY_MM[sex]) / -_BODY_BOTTOM,
+            width=normal(0.96 + 0.08 * sex, 0.06),
+            thickness=normal(1.0, 0.06),
+            rng=rng,
+        ),
+        *rib_bending(middle, np.array([2.0, -29.0, -60.0, -97.0]), 2.2, 14.0, rng),
         Roll(normal(125.0, 8.0), normal(2.0e-3, 4e-4)),
         # The manubrium leans back by what the sternal angle lacks to 180 degrees.
-        Ramp(1, 2, -float(np.tan(np.radians(180 - normal(STERNAL_ANGLE_DEG, 5.0)))), 0.0, 3.0),
-        _bend(normal(0.0, 3.0), normal(0.0, 3.0)),
-        # The sternum's lower end lies farther forward; the rest is how the person lies on the table.
-        Affine.motion(np.array([normal(18.0, 3.0), 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, -40.0])),
-        *breathing(np.array([0.0, 0.0, -45.0]), rng),
-        Affine.motion(rng.normal(scale=2.0, size=3), rng.normal(scale=10.0, size=3), np.array([0.0, 0.0, -40.0])),
+        Ramp(1, 2, -float(np.tan(np.radians(lean_deg))), 0.0, 3.0),
+        _bend(normal(0.0, 3.0), normal(0.0, 4.0)),
+        # The sternum's lower end lies farther forward; the last motion is how the person lies on the table.
+        Affine.motion(np.array([normal(14.0, 3.0), 0.0, 0.0]), np.zeros(3), middle),
+        *breathing(middle, rng),
+        Affine.motion(rng.normal(scale=2.0, size=3), rng.normal(scale=10.0, size=3), middle),
     )
-    return Subject(name, seed, Deformation(steps), normal(10.0, 2.5), normal(0.0, 1.0))
+    return Subject(name, seed, Deformation(steps), fat_mm=normal(10.0, 2.5), cartilage_hu=normal(140.0, 12.0))
 
 
 def _flat_stretch(
-    manubrium: float, body: float, width: float, length: float, excess_5: float, rng: np.random.Generator
+    manubrium: float, body: float, width: float, thickness: float, rng: np.random.Generator
 ) -> tuple[Affine | Ramp | Bumps, ...]:
-    """Stretch of the flat wall: sternum by part, then cartilages by side and level."""
-    edge = 18.0 * width
-    sides = length / width * (1 + 0.02 * np.clip(rng.normal(size=2), -2, 2)) - 1
-    # The lower cartilages share `length`; the 5th differs from the 4th and the upper two by bands across the wall.
-    heights = np.array([3.0 * rng.normal(), 3.0 * rng.normal(), 0, 30.0 * excess_5]).clip(-6, 6)
-    levels_z = body * np.array([2.0, -31.0, -62.0, -100.0])
-    centres = np.column_stack([np.full(8, 75.0), np.zeros(8), np.tile(levels_z, 2)])
-    centres[4:, 0] *= -1
-    widths = np.tile([22.0, np.inf, 14.0], (8, 1))
+    """Stretch of the flat wall: sternum by part, then cartilages by side and level; factors of the canonical size."""
+    # The 4th and 5th cartilage of one person go together (correlation 0.8), the sides nearly so.
+    z4, other = np.clip(rng.normal(size=2), -MAX_SD, MAX_SD)
+    z5 = float(np.clip(0.8 * z4 + 0.6 * other, -MAX_SD, MAX_SD))
+    (mean4, sd4), (mean5, sd5) = CARTILAGE_MM[4], CARTILAGE_MM[5]
+    length4, length5 = (mean4 + sd4 * z4) / _COURSES[4][0], (mean5 + sd5 * z5) / _COURSES[5][0]
+    common = (length4 + length5) / 2
+    sides = common / width * (1 + 0.02 * np.clip(rng.normal(size=2), -MAX_SD, MAX_SD)) - 1
+    edge = 17.0 * width
+    # What is left of each level's own length is a push along it, centred where its cartilage ends.
+    upper = 2.0 * np.clip(rng.normal(size=2), -MAX_SD, MAX_SD)
+    push = [*upper, _COURSES[4][0] * (length4 - common), _COURSES[5][0] * (length5 - common)]
+    ends = edge + common * np.array([_COURSES[level][0] * 0.95 for level in (2, 3, 4, 5)])
+    heights_z = body * np.array([3.0, -29.0, -60.0, -98.0])
+    pushes = [
+        Bumps.one(0, (side * x, 0, z), (20.0, np.inf, 13.0), side * np.clip(h, -8, 8))
+        for side in (1, -1)
+        for x, z, h in zip(ends, heights_z, push, strict=True)
+    ]
     return (
-        Affine.stretch(np.array([width, normal_thickness(rng), body]), np.zeros(3)),
+        Affine.stretch(np.array([width, thickness, body]), np.zeros(3)),
         Ramp(2, 2, manubrium / body - 1, 0.0, 4.0),
         Ramp(0, 0, sides[0], edge, 4.0),
         Ramp(0, 0, -sides[1], -edge, 4.0, direction=-1),
-        *(
-            Bumps(0, centres[k : k + 1], widths[k : k + 1], np.array([heights[k % 4] * (1 if k < 4 else -1)]))
-            for k in range(8)
-        ),
+        *pushes,
     )
-
-
-def normal_thickness(rng: np.random.Generator) -> float:
-    """Stretch of the wall's thickness."""
-    return 1 + 0.06 * float(np.clip(rng.normal(), -1.8, 1.8))
 
 
 def _bend(sternum_mm: float, bulge_mm: float) -> Bumps:
     """Bow the sternum's body, and the front across."""
     return Bumps(
         1,
-        np.array([[0, 0, -45.0], [0, 0, 0]]),
+        np.array([[0, 0, -45.0], [0, 0, 0.0]]),
         np.array([[np.inf, np.inf, 35.0], [45.0, np.inf, np.inf]]),
         np.array([sternum_mm, bulge_mm]),
     )
@@ -380,7 +384,7 @@ def waypoints(subject: Subject) -> Waypoints:
 
 def reference_cloud(subject: Subject, n: int, rng: np.random.Generator) -> PointCloud:
     """``n`` points, uniform by area, of the whole surface of cut sternum and cartilages 2-5, with parts; mm, RAS+."""
-    points, parts, _ = _sample(subject, n, rng, None)
+    points, parts = _sample(subject, n, rng, None)
     return PointCloud(subject.phi.apply(points), f"phantom:{subject.name}", parts)
 
 
@@ -406,13 +410,13 @@ def anterior_cloud(
         offset = middles[:, [0, 2]] - middle
         strip = (np.abs(offset @ along) < half_length) & (np.abs(offset @ [-along[1], along[0]]) < half_width)
         visible &= ~strip
-    points, parts, _ = _sample(subject, n, rng, visible)
+    points, parts = _sample(subject, n, rng, visible)
     points = subject.phi.apply(points)
     return PointCloud(points + rng.normal(scale=noise_mm, size=points.shape), f"phantom-us:{subject.name}", parts)
 
 
-def _sample(subject: Subject, n: int, rng: np.random.Generator, keep: np.ndarray | None) -> tuple[Floats, Ints, Ints]:
-    """Canonical surface points (n, 3), uniform by the subject's own area, their parts and faces."""
+def _sample(subject: Subject, n: int, rng: np.random.Generator, keep: Bools | None) -> tuple[Floats, Ints]:
+    """Canonical surface points (n, 3), uniform by the subject's own area, and their parts."""
     surface = _surface()
     corners = subject.phi.apply(surface.vertices)[surface.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -423,4 +427,138 @@ def _sample(subject: Subject, n: int, rng: np.random.Generator, keep: np.ndarray
     face = np.searchsorted(cumulated, (np.arange(n) + rng.random(n)) / n * cumulated[-1], side="right")
     weights = rng.dirichlet(np.ones(3), size=n)
     points = np.einsum("nk,nki->ni", weights, surface.vertices[surface.faces[face]])
-    return _on_surface(points), surface.parts[face], face
+    return _on_surface(points), surface.parts[face]
+
+
+def measures(subject: Subject) -> dict[str, float]:
+    """Sizes of a subject as an anatomist measures them.
+
+    Returns:
+        ``manubrium_mm``, ``body_mm``, ``sternum_width_mm`` (at levels 3-4), ``sternal_angle_deg``, and
+        ``cartilage_<side>_<level>_mm`` along the middle of the cartilage from sternum to bone.
+    """
+
+    def length(canonical: Floats) -> float:
+        return float(np.linalg.norm(np.diff(subject.phi.apply(canonical), axis=0), axis=1).sum())
+
+    def midline(*z: float) -> Floats:
+        return np.column_stack([np.zeros(len(z)), np.zeros(len(z)), z])
+
+    half = float(_sternum_half_width(np.array([-45.0]))[0])
+    top, upper, lower, bottom = subject.phi.apply(midline(45.0, 8.0, -8.0, -85.0))
+    lean = (top - upper) / np.linalg.norm(top - upper) @ ((bottom - lower) / np.linalg.norm(bottom - lower))
+    sizes = {
+        "manubrium_mm": length(midline(*np.linspace(0, _STERNUM_TOP, 50))),
+        "body_mm": length(midline(*np.linspace(_BODY_BOTTOM, 0, 50))),
+        "sternum_width_mm": length(np.array([[-half, 0, -45.0], [half, 0, -45.0]])),
+        "sternal_angle_deg": float(np.degrees(np.arccos(lean))),
+    }
+    lines = _lines()
+    for side, sign in (("right", 1), ("left", -1)):
+        for level in (2, 3, 4, 5):
+            mine = (lines.level == level) & (lines.side == sign) & (lines.arc >= 0) & (lines.tissue == _CARTILAGE)
+            x, z = lines.xz[mine].T
+            sizes[f"cartilage_{side}_{level}_mm"] = length(np.column_stack([x, np.zeros(len(x)), z]))
+    return sizes
+
+
+# ------------------------------------------------------------------------------------------------------------- CT
+
+
+def ct_volume(subject: Subject, spacing_mm: float, rng: np.random.Generator) -> tuple[Volume, Volume]:
+    """A CT of the front of the chest and its labels, both on the same isotropic grid along R, A, S.
+
+    Voxel centres are taken back to the canonical wall by φ⁻¹; a voxel that a surface cuts gets the mixture of both
+    sides. Only voxels near bone or cartilage are taken back one by one: elsewhere a coarse lattice is interpolated,
+    which moves the skin and the lungs by less than 0.1 mm.
+
+    Args:
+        subject: who.
+        spacing_mm: about 1.5; 2.5 for a quick look.
+        rng: the scanner's noise.
+
+    Returns:
+        int16 Hounsfield units, and uint8 labels with the ids of the open CT's masks: 116 sternum, 118 costal
+        cartilages (all of them), 92-103 left ribs 1-12, 104-115 right ribs 1-12.
+
+    Raises:
+        StudyError: a spacing that cannot show a cartilage.
+    """
+    if not 0.5 <= spacing_mm <= 4.0:
+        raise StudyError(f"expected a spacing of 0.5-4 mm, got {spacing_mm:g}; a cartilage is only 10 mm thick")
+    box = np.stack(np.meshgrid(*np.linspace(_VIEW_LOW, _VIEW_HIGH, 7).T, indexing="ij"), axis=-1).reshape(-1, 3)
+    box = subject.phi.apply(box)
+    origin = np.floor(box.min(axis=0))
+    shape = tuple(int(n) for n in np.ceil((box.max(axis=0) - origin) / spacing_mm) + 1)
+    canonical = _canonical_coordinates(subject, origin, shape, spacing_mm)
+
+    x, y, z = canonical
+    hu = _soft_tissue_hu(x, y, z, subject.fat_mm, spacing_mm)
+    labels = np.zeros(shape, dtype=np.uint8)
+    near = np.argwhere(np.abs(y) < _STERNUM_HALF_THICKNESS_MM + 3)
+    approximate = canonical[:, near[:, 0], near[:, 1], near[:, 2]].T
+    near = near[_distance(approximate) < 1.5 + spacing_mm]
+    exact = subject.phi.inverse(origin + spacing_mm * near)
+    i, j, k = near.T
+    hard, share, ids = _hard_tissue(exact, subject.cartilage_hu, spacing_mm)
+    hu[i, j, k] += share * (hard - hu[i, j, k])
+    labels[i, j, k] = ids
+
+    noise = gaussian_filter(rng.standard_normal(shape, dtype=np.float32), 0.6)  # a scanner's noise is not white
+    hu += (NOISE_HU / noise.std()) * noise
+    grid = RigidTransform(translation=origin)
+    spacing = np.full(3, float(spacing_mm))
+    return (
+        Volume(np.clip(np.round(hu), -1024, 3071).astype(np.int16), spacing, grid, f"phantom:{subject.name}"),
+        Volume(labels, spacing, grid, f"labels of phantom:{subject.name}"),
+    )
+
+
+def _canonical_coordinates(subject: Subject, origin: Floats, shape: tuple[int, ...], spacing_mm: float) -> Floats:
+    """Approximate φ⁻¹ (3, i, j, k) of all voxel centres, from a lattice of 6 mm."""
+    step = _LATTICE_MM / spacing_mm
+    counts = [int(np.ceil((n - 1) / step)) + 1 for n in shape]
+    lattice = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    values = subject.phi.inverse(origin + _LATTICE_MM * lattice).reshape(*counts, 3)
+    for axis, n in enumerate(shape):
+        place = np.arange(n) / step
+        below = np.minimum(place.astype(int), counts[axis] - 2)
+        weight = (place - below).reshape([-1 if a == axis else 1 for a in range(4)])
+        values = np.take(values, below, axis) * (1 - weight) + np.take(values, below + 1, axis) * weight
+    return np.moveaxis(values, -1, 0)
+
+
+def _soft_tissue_hu(x: Floats, y: Floats, z: Floats, fat_mm: float, spacing_mm: float) -> Floats:
+    """Hounsfield units of air, skin, fat, muscle, lung and what lies between and below the lungs."""
+
+    def beyond(distance: Floats) -> Floats:
+        return np.clip(distance / spacing_mm + 0.5, 0, 1)
+
+    muscle = 6.5 + 5 * (1 - np.exp(-((x / 25) ** 2)))  # next to none in front of the sternum
+    skin = muscle + fat_mm
+    dome = -95 - 0.004 * (np.abs(x) - 75) ** 2  # of the diaphragm
+    # Behind the sternum the lungs leave room that widens with depth, more on the left, where the heart lies.
+    straight, depth = x * (1 + y / 125), np.maximum(-y - 10, 0)
+    heart = np.where(x < 0, 25 * np.clip((-20 - z) / 40, 0, 1), 0)
+    lung = beyond(-y - 10) * beyond(z - dome) * beyond(np.abs(straight) - 12 - 0.4 * np.minimum(depth, 40) - heart)
+    hu = np.full(x.shape, 50.0)
+    hu += lung * (-850 - hu)
+    for front, value in ((muscle, -100), (skin, 30), (skin + 2, -1000)):  # fat, skin, air
+        hu += beyond(y - front) * (value - hu)
+    return hu
+
+
+def _hard_tissue(canonical: Floats, cartilage_hu: float, spacing_mm: float) -> tuple[Floats, Floats, Ints]:
+    """Hounsfield units (n,) of bone or cartilage, its share (n,) of the voxel, and label ids (n,), 0 outside."""
+    lines = _lines()
+    sternum = _sternum_distance(canonical)
+    tube, index = _tube_distance(canonical)
+    distance = np.minimum(sternum, tube)
+    is_sternum = sternum <= tube
+    is_bone = is_sternum | (lines.tissue[index] == _BONE)
+    cortex = np.clip((distance + 1.5) / spacing_mm + 0.5, 0, 1)  # the outer 1.5 mm of bone
+    marrow = np.where(is_sternum, 110.0, 220.0)
+    hu = np.where(is_bone, marrow + cortex * (550.0 - marrow), cartilage_hu)
+    rib = lines.level[index] + np.where(lines.side[index] > 0, RIGHT_RIB_ID, LEFT_RIB_ID)
+    ids = np.where(is_sternum, STERNUM_ID, np.where(is_bone, rib, CARTILAGE_ID))
+    return hu, np.clip(0.5 - distance / spacing_mm, 0, 1), np.where(distance < 0, ids, 0)
