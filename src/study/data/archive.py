@@ -79,7 +79,9 @@ def open_member(archive: Path, wanted: str) -> Iterator[IO[bytes]]:
             with packed:
                 yield packed
     except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError) as error:
-        raise StudyError(f"{where}: expected a sound zip or tar archive, got {error}; delete it and fetch again") from error
+        raise StudyError(
+            f"{where}: expected a sound zip or tar archive, got {error}; delete it and fetch again"
+        ) from error
 
 
 def blocks(stream: IO[bytes]) -> Iterator[bytes]:

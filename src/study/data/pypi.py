@@ -29,7 +29,9 @@ def index_url() -> str:
     try:
         config.read(_pip_config_files(), encoding="utf-8")
     except (configparser.Error, UnicodeDecodeError) as error:
-        raise StudyError(f"expected a readable pip configuration, got {error}; correct it or set PIP_INDEX_URL") from error
+        raise StudyError(
+            f"expected a readable pip configuration, got {error}; correct it or set PIP_INDEX_URL"
+        ) from error
     return config.get("global", "index-url", fallback="").strip() or PYPI_SIMPLE_ENDPOINT
 
 
@@ -74,7 +76,8 @@ def file_url(project: str, archive: str, sha256: str, web: Web) -> str:
     published = package.digests.get("sha256", sha256)
     if published != sha256:
         raise StudyError(
-            f"{shown(index)}: expected {archive} with sha256 {sha256}, got {published}; this is another file, not fetched"
+            f"{shown(index)}: expected {archive} with sha256 {sha256}, got {published}; "
+            "this is another file, not fetched"
         )
     return _with_login(package.url, index)
 

@@ -104,12 +104,13 @@ class Web:
             part.write_bytes(b"")
         best, failures = part.stat().st_size, 0
         if bar is not None:
+            bar.total = n_bytes
             bar.update(best)
         while (have := part.stat().st_size) < n_bytes:
             until = n_bytes if whole else min(have + self.range_bytes, n_bytes)
             try:
                 self._append(url, part, have, until, offset, whole=whole, bar=bar)
-            except (TransportError, requests.ConnectionError, requests.Timeout) as error:
+            except TransportError as error:
                 reason: Exception | str = error
             else:
                 reason = "the answer ended early"
@@ -147,7 +148,7 @@ class Web:
                 )
             length = response.headers.get("Content-Length", "")
             if not have and whole and length.isdigit() and int(length) != until:
-                raise StudyError(f"{shown(url)}: expected {until} bytes, got {length}; this is another file, not fetched")
+                raise StudyError(f"{shown(url)}: expected {until} bytes, got {length}; another file, not fetched")
             with part.open("ab" if have else "wb") as file:
                 for block in response.raw.stream(BLOCK_BYTES, decode_content=False):
                     block = block[: until - have]

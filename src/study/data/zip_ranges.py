@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import struct
+import time
 import zipfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import requests
 from remotezip import RangeNotSupported, RemoteIOError, RemoteZip, RemoteZipError
 from tqdm import tqdm
 from urllib3.exceptions import HTTPError as TransportError
 
 from study.data.archive import BLOCK_BYTES, check_regular, find_member, write_checked
-from study.data.web import RangesRefused, Web, reported, shown
+from study.data.web import RangesRefused, Web, shown
 from study.errors import StudyError
 
 DIRECTORY_TAIL_BYTES = 256 << 10  # one request brings the whole directory of an archive of a few hundred members
@@ -47,7 +47,9 @@ class RemoteArchive:
         info = self.members[find_member(self.members, wanted, where)]
         check_regular(info, where)
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise StudyError(f"{where}: expected a stored or deflated member, got method {info.compress_type} in {wanted!r}")
+            raise StudyError(
+                f"{where}: expected a stored or deflated member, got method {info.compress_type} in {wanted!r}"
+            )
         return info
 
     def fetch(self, wanted: str, target: Path, *, sha256: str | None, n_bytes: int | None, bar: tqdm | None) -> str:
@@ -97,7 +99,7 @@ def open_remote(url: str, web: Web, archive_bytes: int | None = None) -> RemoteA
     """
     for attempt in range(web.attempts):
         try:
-            with reported(url), RemoteZip(url, DIRECTORY_TAIL_BYTES, session=web.session, timeout=web.timeout_s) as remote:
+            with RemoteZip(url, DIRECTORY_TAIL_BYTES, session=web.session, timeout=web.timeout_s) as remote:
                 members = {info.filename: info for info in remote.infolist()}
                 n_bytes = remote.size()
             break
@@ -106,13 +108,18 @@ def open_remote(url: str, web: Web, archive_bytes: int | None = None) -> RemoteA
             raise RangesRefused(
                 f"{shown(url)}: expected a server that serves byte ranges, got the whole archive ({size})"
             ) from error
-        except (TransportError, requests.ConnectionError) as error:  # the line dropped inside the directory
+        except TransportError as error:  # the line dropped inside the directory
             if attempt + 1 == web.attempts:
-                raise StudyError(f"{shown(url)}: expected the archive's directory, got {error}; try again later") from error
+                raise StudyError(
+                    f"{shown(url)}: expected the archive's directory, got {error}; try again later"
+                ) from error
+            time.sleep(web.backoff_s * 2**attempt)
         except RemoteIOError as error:
             raise StudyError(f"{shown(url)}: expected the archive's directory, got {error}; check `url`") from error
         except (zipfile.BadZipFile, RemoteZipError) as error:
-            raise StudyError(f"{shown(url)}: expected a zip archive, got {error}; check `url` in the manifest") from error
+            raise StudyError(
+                f"{shown(url)}: expected a zip archive, got {error}; check `url` in the manifest"
+            ) from error
     if archive_bytes is not None and n_bytes != archive_bytes:
         raise StudyError(
             f"{shown(url)}: expected an archive of {archive_bytes} bytes, got {n_bytes}; "
