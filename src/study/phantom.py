@@ -303,7 +303,7 @@ def draw_subject(name: str, seed: int) -> Subject:
         Roll(normal(125.0, 8.0), normal(2.0e-3, 4e-4)),
         # The manubrium leans back by what the sternal angle lacks to 180 degrees.
         Ramp(1, 2, -float(np.tan(np.radians(lean_deg))), 0.0, 3.0),
-        _bend(normal(0.0, 3.0), normal(0.0, 4.0)),
+        _bend(normal(0.0, 3.0), normal(1.5, 2.5)),
         # The sternum's lower end lies farther forward; the last motion is how the person lies on the table.
         Affine.motion(np.array([normal(14.0, 3.0), 0.0, 0.0]), np.zeros(3), middle),
         *breathing(middle, rng),
