@@ -94,6 +94,7 @@ class PointCloud:
         points: (n, 3) mm.
         name: what the cloud is, for messages: ``"ct:lidc-0001"``.
         parts: (n,) int64 of `Part`, or None before labelling.
+        front: (3,) unit vector towards the skin where the cloud knows it (a probe does), else None.
 
     Raises:
         StudyError: shape, NaN, fewer than 50 points, or an extent that cannot be a chest in millimetres.
@@ -102,6 +103,7 @@ class PointCloud:
     points: Floats
     name: str = "cloud"
     parts: Ints | None = None
+    front: Floats | None = None
 
     def __post_init__(self) -> None:
         points = as_points(self.points, self.name, at_least=MIN_POINTS)
@@ -130,7 +132,8 @@ class PointCloud:
 
     def moved(self, transform: RigidTransform) -> PointCloud:
         """The same cloud in another frame."""
-        return replace(self, points=transform.apply(self.points))
+        front = None if self.front is None else transform.rotation @ self.front
+        return replace(self, points=transform.apply(self.points), front=front)
 
 
 @dataclass(frozen=True)

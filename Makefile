@@ -1,0 +1,60 @@
+# Two commands do everything: `make study` and `make test`. The rest is listed by `make help`.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+JOBS ?= 2
+RUNS := results/runs
+export PYTHONHASHSEED := 0
+# One arithmetic thread a process: sums then have one order, and two workers do not fight over two cores.
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+export NUMEXPR_NUM_THREADS := 1
+
+.PHONY: help setup study test check notebooks reference bench lock clean
+
+help:  ## this list
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+setup: $(STAMP)  ## create .venv from environment.lock
+
+$(STAMP): environment.lock pyproject.toml tools/setup.sh tools/check_system.py
+	@bash tools/setup.sh $(VENV)
+	@touch $@
+
+study: $(STAMP)  ## run the whole study; prints the tables and where the figures are
+	$(BIN)/study run --dataset phantom --jobs $(JOBS) --out $(RUNS)/phantom
+	$(BIN)/study run --dataset open --jobs $(JOBS) --out $(RUNS)/open
+	$(BIN)/study run --dataset planted --jobs $(JOBS) --out $(RUNS)/planted
+	$(BIN)/python tools/notebooks.py run --out $(RUNS)/notebooks
+	$(BIN)/study report $(RUNS)
+
+test: $(STAMP)  ## every test, and the notebooks on the quick profile
+	$(BIN)/pytest -n $(JOBS) --dist worksteal
+
+check: $(STAMP)  ## ruff, types, import layers, notebook pairing
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python tools/notebooks.py check
+
+notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
+	$(BIN)/python tools/notebooks.py write
+
+reference: $(STAMP)  ## renew results/reference from results/runs (a CHANGELOG entry says why)
+	for d in phantom open planted; do \
+	  mkdir -p results/reference/$$d && cp -r $(RUNS)/$$d/. results/reference/$$d/; done
+
+bench: $(STAMP)  ## ratios and rates quoted in the README
+	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+lock: $(STAMP)  ## renew environment.lock from pyproject.toml
+	bash tools/lock.sh
+
+clean:  ## remove the environment and the runs, keep downloads
+	rm -rf $(VENV) $(RUNS) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,0 +1,210 @@
+"""Coarse alignment of two clouds from any rigid pose (sec. III-A)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from study.cartilage import Branches, find_branches
+from study.errors import StudyError
+from study.sternum import SternumFit, SternumParams, feature_plane, sternum_candidates, symmetry_axis
+from study.types import CARTILAGES, ChestFrame, Floats, Part, PointCloud, RigidTransform
+
+MIN_BULGE_MM = 0.2
+
+
+@dataclass(frozen=True)
+class Chest:
+    """A cloud whose sternum, branches, sides and levels are known.
+
+    Attributes:
+        cloud: the points with ``parts`` set.
+        T_cloud_chest: chest coordinates (x left, y up, z front; origin on the sternum's front) to the cloud's frame.
+        sternum_overlap: F_k over the area of the rectangle (Eq. 1).
+        bend_ratio: bend of the branches taken as 5th over that of the branches taken as 2nd.
+        bulge_mm: mean arch of the branches towards the front.
+    """
+
+    cloud: PointCloud
+    T_cloud_chest: RigidTransform
+    sternum_overlap: float
+    bend_ratio: float
+    bulge_mm: float
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Two chests and the motion that overlays their sternums (sec. III-A)."""
+
+    source: Chest
+    target: Chest
+
+    @property
+    def T_us_ct(self) -> RigidTransform:
+        """CT frame to US frame."""
+        return self.target.T_cloud_chest @ self.source.T_cloud_chest.inverse
+
+
+def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
+    """Find sternum, branches, sides and levels in a cloud in any rigid pose (sec. III-A).
+
+    The view is first taken from either face of the feature plane: sternum and branches look alike in a mirror. The
+    branches then tell the front, since each arches towards it, and the foot, since the 5th bend most.
+
+    Raises:
+        StudyError: no chest-like plane, no sternum, or not four branches on each side.
+    """
+    p = params or SternumParams()
+    T_cloud_plane = feature_plane(cloud)
+    flat = T_cloud_plane.inverse.apply(cloud.points)[:, :2]
+    fit, T_plane_sternum, branches = _sternum_with_branches(flat, p, cloud.name)
+    T_cloud_sternum = T_cloud_plane @ T_plane_sternum
+    local = T_cloud_sternum.inverse.apply(cloud.points)
+    numbers = branches.branch
+    bulge = float(np.mean([_bulge_mm(local[numbers == k], local[numbers == 0]) for k in range(1, 9)]))
+    if cloud.front is not None:
+        bulge = float(cloud.front @ T_cloud_sternum.rotation[:, 2])
+    if abs(bulge) < MIN_BULGE_MM:
+        raise StudyError(
+            f"{cloud.name}: expected cartilages that arch {MIN_BULGE_MM} mm or more to the front, got "
+            f"{abs(bulge):.2f} mm, so front and back look alike; give the cloud its `front` direction"
+        )
+    bend_low, bend_high = (np.mean([_bend_mm(local[numbers == k]) for k in ends]) for ends in ((1, 5), (4, 8)))
+    # Half a turn about y looks from the other face, half a turn about z turns the foot down: never a reflection.
+    if bulge < 0:
+        T_cloud_sternum = T_cloud_sternum @ RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+        numbers = np.choose(numbers + 1, [-1, 0, 5, 6, 7, 8, 1, 2, 3, 4])
+    if bend_high > bend_low:
+        T_cloud_sternum = T_cloud_sternum @ RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+        numbers = np.choose(numbers + 1, [-1, 0, 8, 7, 6, 5, 4, 3, 2, 1])
+    names = [Part.UNKNOWN, Part.STERNUM]
+    names += [Part.cartilage(side, level) for side in ("right", "left") for level in (5, 4, 3, 2)]  # x is left, y up
+    parts = np.array(names, dtype=np.int64)[numbers + 1]
+    front = sternum_front_mm(T_cloud_sternum.inverse.apply(cloud.points), p)
+    T_cloud_chest = T_cloud_sternum @ RigidTransform(np.eye(3), np.array([0.0, 0.0, front]))
+    ratio = max(bend_low, bend_high) / max(min(bend_low, bend_high), 1e-9)
+    return Chest(replace(cloud, parts=parts), T_cloud_chest, fit.overlap, float(ratio), abs(bulge))
+
+
+def _sternum_with_branches(
+    flat: Floats, params: SternumParams, name: str
+) -> tuple[SternumFit, RigidTransform, Branches]:
+    """The best covered rectangle that four separate branches leave on each side."""
+    first_error: StudyError | None = None
+    best = 0.0
+    lifted = np.column_stack([flat, np.zeros(len(flat))])
+    for fit in sternum_candidates(flat, params):
+        best = max(best, fit.overlap)
+        if fit.overlap < params.min_overlap:
+            continue
+        T_plane_sternum = _turn(np.radians(fit.angle_deg), fit.centre)
+        local = T_plane_sternum.inverse.apply(lifted)[:, :2]
+        angle_deg, shift = symmetry_axis(local)
+        turn = _turn(np.radians(angle_deg), np.zeros(2))
+        T_plane_sternum = T_plane_sternum @ turn @ _turn(0.0, np.array([shift, 0.0]))
+        local = T_plane_sternum.inverse.apply(lifted)[:, :2]
+        try:
+            branches = find_branches(local, params.height_mm, name)
+        except StudyError as error:
+            first_error = first_error or error
+            continue
+        # The rectangle slides along a longer or shorter sternum; the eight attachments do not.
+        along = np.array([0.0, branches.seeds[:, 1].mean()])
+        return fit, T_plane_sternum @ _turn(0.0, along), branches
+    if first_error is not None:
+        raise first_error
+    raise StudyError(
+        f"no sternum found in {name!r}: best overlap {best:.2f} of a {params.width_mm:g} × {params.height_mm:g} mm "
+        f"rectangle, need {params.min_overlap:.2f}; check that the cloud holds sternum and cartilages 2-5"
+    )
+
+
+def _turn(angle: float, shift: Floats) -> RigidTransform:
+    """A motion in the feature plane: counter-clockwise turn, then a shift."""
+    c, s = np.cos(angle), np.sin(angle)
+    return RigidTransform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.append(shift, 0.0))
+
+
+def _bulge_mm(branch: Floats, sternum: Floats) -> float:
+    """How far a branch arches towards z (mm): the chest bulges to the front.
+
+    Two readings of one curvature: the rise of the branch above the chord between its ends, and the fall of its
+    lateral end behind the sternum beside it, the latter scaled to the former's span.
+    """
+    x, y, z = branch.T
+    along = np.abs(x)
+    a, b = np.percentile(along, [5, 95])
+    t = 2 * (along - a) / (b - a) - 1
+    design = np.column_stack([np.ones_like(t), t, y - y.mean(), t * t])
+    rise = -float(np.linalg.lstsq(design, z, rcond=None)[0][3])
+    root = y[along < a + 0.3 * (b - a)].mean()
+    beside = np.abs(sternum[:, 1] - root) < 15.0
+    if not beside.any():
+        return rise
+    fall = float(sternum[beside, 2].mean() - z[along > b - 0.2 * (b - a)].mean())
+    return rise + fall * ((b - a) / 2 / b) ** 2
+
+
+def _bend_mm(branch: Floats) -> float:
+    """How far a branch strays in the feature plane from the straight line between its ends (mm)."""
+    flat = branch[:, :2] - branch[:, :2].mean(axis=0)
+    _, _, axes = np.linalg.svd(flat, full_matrices=False)
+    along, across = (flat @ axes.T).T
+    a, b = np.percentile(along, [2, 98])
+    t = 2 * (along - a) / (b - a) - 1
+    return abs(float(np.polynomial.polynomial.polyfit(t, across, 2)[2]))
+
+
+def sternum_front_mm(local: Floats, params: SternumParams) -> float:
+    """Depth of the sternum's front surface in sternum coordinates, mm.
+
+    The foremost point of each 5 mm cell counts, so that a tube's whole surface and the sheet that ultrasound
+    sees give the same answer.
+    """
+    x, y, z = local.T
+    on = (np.abs(x) < params.width_mm / 2) & (np.abs(y) < params.height_mm / 2)
+    cells = np.floor(local[on, :2] / 5.0).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    foremost = np.full(cell.max() + 1, -np.inf)
+    np.maximum.at(foremost, cell, z[on])
+    return float(np.median(foremost))
+
+
+def align(source: PointCloud, target: PointCloud, params: SternumParams | None = None) -> Alignment:
+    """Overlay the sternums of two clouds, sides and levels matched (sec. III-A).
+
+    Args:
+        source: CT cloud, any rigid pose.
+        target: US cloud, any rigid pose.
+        params: the sternum templates.
+    """
+    return Alignment(find_chest(source, params), find_chest(target, params))
+
+
+def chest_frame(cloud: PointCloud) -> ChestFrame:
+    """The frame the template graph is drawn in, from a labelled cloud.
+
+    Raises:
+        StudyError: a part is missing.
+    """
+    missing = [part.name for part in (Part.STERNUM, *CARTILAGES) if len(cloud.only(part)) < 3]
+    if missing:
+        raise StudyError(f"{cloud.name}: expected points on every part, got none on {', '.join(missing)}")
+    sternum = cloud.only(Part.STERNUM)
+    origin = sternum.mean(axis=0)
+    centre = {part: cloud.only(part).mean(axis=0) for part in CARTILAGES}
+    left = np.mean([centre[p] - centre[q] for p, q in zip(CARTILAGES[4:], CARTILAGES[:4], strict=True)], axis=0)
+    up = np.linalg.svd(sternum - origin, full_matrices=False)[2][0]
+    heads = np.mean([centre[p] for p in CARTILAGES if p.level == 2], axis=0)
+    feet = np.mean([centre[p] for p in CARTILAGES if p.level == 5], axis=0)
+    up = up * np.sign(up @ (heads - feet))
+    left = left - (left @ up) * up
+    left /= np.linalg.norm(left)
+    x, y = (sternum - origin) @ left, (sternum - origin) @ up
+    (x0, x1), (y0, y1) = np.percentile(x, [2, 98]), np.percentile(y, [1, 99])
+    origin = origin + (x0 + x1) / 2 * left + (y0 + y1) / 2 * up
+    reach = {
+        part: float(np.percentile(np.abs((cloud.only(part) - origin) @ left), 98) - (x1 - x0) / 2) for part in CARTILAGES
+    }
+    return ChestFrame(origin, left, up, np.cross(left, up), float(y1 - y0), float(x1 - x0), reach)

@@ -1,0 +1,126 @@
+"""Self-organising map on graph distance (sec. III-B, Eq. 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from scipy.spatial import KDTree
+
+from study.errors import StudyError
+from study.types import Floats, Ints, SkeletonGraph
+
+RateSchedule = Literal["constant", "linear", "compounding"]
+
+
+@dataclass(frozen=True)
+class SomParams:
+    """Schedule of one map.
+
+    Attributes:
+        epochs: passes after pre-training; the paper states no number.
+        samples: points drawn per epoch.
+        rate: learning rate l_r of the main epochs (0.1 in the paper).
+        rate_schedule: ``"constant"`` (the paper), ``"linear"`` to 0, or ``"compounding"`` (the authors' code).
+        radius: start of the neighbourhood radius in hops; it falls to 1.
+        pretrain_epochs, pretrain_rate: epochs on the directed graph (3 at 0.02 in the paper).
+    """
+
+    epochs: int = 1000
+    samples: int = 500
+    rate: float = 0.1
+    rate_schedule: RateSchedule = "constant"
+    radius: float = 5.0
+    pretrain_epochs: int = 3
+    pretrain_rate: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.epochs < 1 or self.samples < 1 or self.pretrain_epochs < 0:
+            raise StudyError(f"expected at least one epoch of one sample, got {self.epochs} of {self.samples}")
+        if not (0 < self.rate <= 1 and 0 <= self.pretrain_rate <= 1 and self.radius >= 1):
+            raise StudyError(
+                f"expected rates in (0, 1] and radius >= 1 hop, got {self.rate}, {self.pretrain_rate}, {self.radius}"
+            )
+        if self.rate_schedule not in ("constant", "linear", "compounding"):
+            raise StudyError(f"expected rate_schedule constant|linear|compounding, got {self.rate_schedule!r}")
+
+    def rate_at(self, epoch: int) -> float:
+        """Learning rate of a main epoch."""
+        if self.rate_schedule == "constant":
+            return self.rate
+        if self.rate_schedule == "linear":
+            return self.rate * (1 - epoch / self.epochs)
+        # The authors' code multiplies the rate by (1 - e/E) at every epoch: prod_{i<=e} (1 - i/E).
+        return float(self.rate * np.prod(1 - np.arange(epoch + 1) / self.epochs))
+
+    def radius_at(self, epoch: int) -> float:
+        """Neighbourhood radius of a main epoch, in hops: the authors' step rule."""
+        return float(int((self.radius - 1) * (1 - epoch / self.epochs)) + 1)
+
+
+def neighbourhood(hops: Ints, radius: float) -> Floats:
+    """theta of Eq. 2: (m, m), row = winner; ``exp(-hops² / (2 radius²))``, 0 where no path leads."""
+    theta = np.exp(-(hops.astype(np.float64) ** 2) / (2 * radius**2))
+    return np.where(hops >= len(hops), 0.0, theta)
+
+
+@njit(cache=True)
+def _epoch(nodes, points, theta, rate):  # type: ignore[no-untyped-def]
+    m = nodes.shape[0]
+    for k in range(points.shape[0]):
+        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        winner, best = 0, np.inf
+        for s in range(m):
+            dx, dy, dz = px - nodes[s, 0], py - nodes[s, 1], pz - nodes[s, 2]
+            d = dx * dx + dy * dy + dz * dz
+            if d < best:
+                winner, best = s, d
+        for s in range(m):
+            step = theta[winner, s] * rate  # Eq. 2
+            nodes[s, 0] += step * (px - nodes[s, 0])
+            nodes[s, 1] += step * (py - nodes[s, 1])
+            nodes[s, 2] += step * (pz - nodes[s, 2])
+
+
+def fit_som(
+    graph: SkeletonGraph, points: Floats, params: SomParams, rng: np.random.Generator
+) -> tuple[SkeletonGraph, tuple[float, ...]]:
+    """Pull ``graph`` onto ``points`` by Eq. 2, one drawn point at a time (sec. III-B).
+
+    Pre-training runs on the directed graph, the rest on the undirected one.
+
+    Args:
+        graph: start positions and topology, mm.
+        points: (n, 3) mm, same frame.
+        params: the schedule.
+        rng: draws the points.
+
+    Returns:
+        the fitted graph, and the quantisation error (mean distance from points to their nearest node, mm)
+        at twenty even steps.
+    """
+    nodes = np.array(graph.nodes)
+
+    def draw() -> Floats:
+        return points[rng.integers(len(points), size=params.samples)]
+
+    theta = neighbourhood(graph.hops(directed=True), params.radius)
+    for _ in range(params.pretrain_epochs):
+        _epoch(nodes, draw(), theta, params.pretrain_rate)
+    undirected = graph.hops(directed=False)
+    radius, history = np.nan, []
+    for epoch in range(params.epochs):
+        if params.radius_at(epoch) != radius:
+            radius = params.radius_at(epoch)
+            theta = neighbourhood(undirected, radius)
+        _epoch(nodes, draw(), theta, params.rate_at(epoch))
+        if epoch % max(1, params.epochs // 20) == 0 or epoch == params.epochs - 1:
+            history.append(quantisation_error_mm(nodes, points))
+    return graph.with_nodes(nodes), tuple(history)
+
+
+def quantisation_error_mm(nodes: Floats, points: Floats) -> float:
+    """Mean distance from points to their nearest node, mm."""
+    return float(KDTree(nodes).query(points)[0].mean())
