@@ -73,6 +73,11 @@ def test_the_jacobian_of_a_stretch_is_its_volume_change():
     assert np.allclose(Deformation((STEPS["stretch"],)).jacobian_determinant(box()), 1.1 * 0.9 * 1.2)
 
 
+def test_a_motion_is_rigid():
+    assert residual_mm(box(), STEPS["motion"].apply(box())) < 1e-9
+    assert np.allclose(STEPS["motion"].apply(CENTRE[None]), CENTRE + (5.0, 6.0, 7.0))
+
+
 def test_the_roll_keeps_arc_length_and_the_midline():
     arc = np.column_stack([np.linspace(-80, 80, 2001), np.zeros(2001), np.full(2001, -40.0)])
     rolled = Roll(120.0, 2e-3).apply(arc)
