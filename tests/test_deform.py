@@ -75,7 +75,7 @@ def test_the_jacobian_of_a_stretch_is_its_volume_change():
 
 def test_a_motion_is_rigid():
     assert residual_mm(box(), STEPS["motion"].apply(box())) < 1e-9
-    assert np.allclose(STEPS["motion"].apply(CENTRE[None]), CENTRE + (5.0, 6.0, 7.0))
+    assert np.allclose(STEPS["motion"].apply(CENTRE[None]), CENTRE + np.array([5.0, 6.0, 7.0]))
 
 
 def test_the_roll_keeps_arc_length_and_the_midline():
