@@ -423,19 +423,37 @@ def simulate_sweep(
         masks=masks,
         pixel_spacing_mm=(probe.pixel_mm, probe.pixel_mm),
         T_probe_image=probe.T_probe_image @ _calibration_error(errors, calibration, probe),
-        latency_s=LATENCY_S - errors.latency_uncorrected_s + residual_s,
+        latency_s=float(LATENCY_S - errors.latency_uncorrected_s + residual_s),
         name=name,
     )
 
 
 def _line_centres(skin: _Skin, probe: Probe, errors: SweepErrors, rng: np.random.Generator) -> Floats:
     """Where the lines run, (k,) mm along the left-right axis."""
-    width = skin.high[0] - skin.low[0] + 10.0
+    a = np.arange(skin.low[0] - 60.0, skin.high[0] + 60.0)
+    b = np.linspace(skin.low[1], skin.high[1], 7)
+    points, normals = skin.points(np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2))
+    across = np.cross(normals, skin.axes[1])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    # Around a chest the beams of neighbouring lines converge: what counts is how wide a line sees at the bone.
+    bone = points - (probe.skin_mm + 4.0) * normals
+    edges = [((bone + side * probe.aperture_mm / 2 * across) @ skin.axes[0]).reshape(len(a), -1) for side in (-1, 1)]
+    low, high = np.sort([edge.mean(axis=1) for edge in edges], axis=0)
     # Each line begins where the last one ended, less the overlap, or plus the strip that was missed.
-    gaps = errors.missed_mm * rng.uniform(0.5, 1.5, 100) if errors.missed_mm else np.full(100, -probe.overlap_mm)
-    n = 1 + int(np.searchsorted(np.cumsum(probe.aperture_mm + gaps), width - probe.aperture_mm))
-    centres = np.concatenate([[0.0], np.cumsum(probe.aperture_mm + gaps[: n - 1])])
-    return centres - centres.mean() + (skin.low[0] + skin.high[0]) / 2
+    strips = errors.missed_mm * rng.uniform(0.5, 1.5, 100) if errors.missed_mm else np.full(100, -probe.overlap_mm)
+    margin = 5.0
+
+    def lines_from(start: float) -> tuple[Floats, float]:
+        centres = [float(np.interp(start, low, a))]
+        for strip in strips:
+            end = float(np.interp(centres[-1], a, high))
+            if end >= skin.high[0] + margin or centres[-1] >= a[-1]:
+                break
+            centres.append(float(np.interp(end + strip, low, a)))
+        return np.array(centres), end - skin.high[0] - margin
+
+    _, spare = lines_from(skin.low[0] - margin)
+    return lines_from(skin.low[0] - margin - spare / 2)[0]
 
 
 def _path(skin: _Skin, probe: Probe, centres: Floats) -> tuple[Floats, Floats]:

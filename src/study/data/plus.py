@@ -508,7 +508,7 @@ def _read_masks(folder: Path, names: list[str]) -> Bools:
                     f"{name}: expected {masks.shape[2]} x {masks.shape[1]} pixels as in the first mask, got"
                     f" {size[0]} x {size[1]}; export all frames alike"
                 )
-            masks[i] = sitk.GetArrayViewFromImage(reader.Execute()) > 0
+            masks[i] = sitk.GetArrayFromImage(reader.Execute()) > 0
         except RuntimeError as error:
             raise StudyError(
                 f"{name}: expected a readable image, got a damaged one ({type(error).__name__})"

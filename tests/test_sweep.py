@@ -1,0 +1,325 @@
+"""The virtual sweep: every error alone, of the size it claims, over an anatomy that is known."""
+
+import dataclasses
+import time
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
+from trimesh.creation import box
+
+from study.errors import StudyError
+from study.sweep import (
+    ERROR_SOURCES,
+    LATENCY_S,
+    Probe,
+    SweepErrors,
+    error_budget,
+    error_table,
+    simulate_latency_run,
+    simulate_sweep,
+    surface_distance_mm,
+    true_parts,
+    visible_mesh,
+    visible_surface,
+)
+from study.types import Mesh, Part, RigidTransform, TrackedSweep
+from study.us import calibrate_latency, contour_points, sweep_cloud
+
+FRONT = (0.0, 1.0, 0.0)
+
+
+def arch_mm(x, z):
+    return -((x / 90) ** 2) * 35 - (z / 80) ** 2 * 6
+
+
+@pytest.fixture(scope="module")
+def chest() -> Mesh:
+    """A plate and eight tubes of 10 mm, arched like a small chest, marching cubes at 1.5 mm."""
+    step = 1.5
+    x, y, z = np.meshgrid(np.arange(-66, 67, step), np.arange(-33, 12, step), np.arange(-60, 61, step), indexing="ij")
+    arch = arch_mm(x, z)
+    fields = {Part.STERNUM: np.maximum.reduce([np.abs(x) - 16, np.abs(y - arch) - 5, np.abs(z) - 52])}
+    for side, sign in (("right", 1), ("left", -1)):
+        for level in (2, 3, 4, 5):
+            height = 45 - 27 * (level - 2) - 0.15 * np.abs(x)
+            tube = np.hypot(y - arch, z - height) - 5
+            fields[Part.cartilage(side, level)] = np.maximum.reduce([tube, 12 - sign * x, sign * x - 60])
+    stack = np.stack(list(fields.values()))
+    vertices, faces, _, _ = marching_cubes(stack.min(axis=0), 0.0, spacing=(step,) * 3)
+    cells = np.clip(np.rint(vertices / step).astype(int), 0, np.array(x.shape) - 1)
+    parts = np.array([int(part) for part in fields])[stack[(slice(None), *cells.T)].argmin(axis=0)]
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    volume = np.einsum("ni,ni->", corners.mean(axis=1), normals)
+    return Mesh(
+        vertices + np.array([-66.0, -33.0, -60.0]), faces if volume > 0 else faces[:, ::-1], parts, name="chest"
+    )
+
+
+@pytest.fixture(scope="module")
+def seen(chest) -> Mesh:
+    return visible_mesh(chest, FRONT)
+
+
+@pytest.fixture(scope="module")
+def record(chest):
+    """Sweeps over the chest; the last few are kept, a sweep is tens of megabytes."""
+
+    @lru_cache(maxsize=4)
+    def make(errors: SweepErrors, seed: int = 0) -> TrackedSweep:
+        return simulate_sweep(chest, FRONT, errors, np.random.default_rng(seed))
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def mean_error_mm(record, seen):
+    return lambda errors, seed=0: surface_distance_mm(sweep_cloud(record(errors, seed)).cloud.points, seen).mean()
+
+
+def test_without_errors_the_cloud_is_the_visible_surface(chest, record, seen):
+    result = sweep_cloud(record(SweepErrors.none()))
+    distance = surface_distance_mm(result.cloud.points, seen)
+    assert distance.mean() < 0.2
+    assert np.percentile(distance, 99) < 1.5
+    # ... and all of it: the points of the independent fixture have cloud beside them.
+    fixture = visible_surface(chest, FRONT, 2.0, np.random.default_rng(0))
+    assert np.mean(KDTree(result.cloud.points).query(fixture.points)[0] < 2.5) > 0.98
+    assert result.report.n_dropped == 0
+    assert result.cloud.parts is None
+    assert result.front @ FRONT > 0.95
+    assert set(true_parts(result.cloud.points, chest)) == set(range(9))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_with_every_error_the_cloud_lies_within_1_5_mm(mean_error_mm, seed):
+    error = mean_error_mm(SweepErrors(), seed)
+    assert 0.3 < error < 1.5
+
+
+def test_uncorrected_latency_shifts_by_speed_times_lag(record):
+    errors = SweepErrors.only("latency")
+    sweep = record(errors)
+    assert sweep.latency_s == 0
+    wrong, frames, _, _ = contour_points(sweep)
+    right, also, _, _ = contour_points(dataclasses.replace(sweep, latency_s=LATENCY_S))
+    assert (frames == also).all()
+    shift = np.linalg.norm(wrong - right, axis=1)
+    # The hand strays and tilts: its speed is 20 mm/s on the average over the lines, within a tenth.
+    assert np.median(shift) == pytest.approx(Probe().speed_mm_s * LATENCY_S, rel=0.1)
+    # Neighbouring lines run in opposite directions, so the shift tears them apart.
+    along = (wrong - right)[np.abs(shift - 5.36) < 1, 2]
+    assert (along > 4).mean() > 0.2
+    assert (along < -4).mean() > 0.2
+
+
+def test_uncorrected_latency_spoils_the_cloud(mean_error_mm):
+    corrected = mean_error_mm(SweepErrors())
+    left_in = dataclasses.replace(SweepErrors(), latency_uncorrected_s=LATENCY_S)
+    assert mean_error_mm(left_in) > corrected + 0.5
+
+
+def depths_mm(sweep):
+    """Depth of the contour per frame and column, NaN without."""
+    first = sweep.masks.argmax(axis=1) * sweep.pixel_spacing_mm[1]
+    return np.where(sweep.masks.any(axis=1), first, np.nan)
+
+
+def test_fat_makes_echoes_seem_deeper(record):
+    clean, fat = (record(errors) for errors in (SweepErrors.none(), SweepErrors.only("speed of sound")))
+    assert np.nanmin(depths_mm(clean)) > 5
+    assert np.nanmean(depths_mm(fat) - depths_mm(clean)) == pytest.approx(10 * (1540 / 1440 - 1), abs=0.02)
+    np.testing.assert_array_equal(clean.poses, fat.poses)
+
+
+def test_contour_jitter_has_its_size(record):
+    clean, jitter = (record(errors) for errors in (SweepErrors.none(), SweepErrors.only("contour jitter")))
+    difference = depths_mm(jitter) - depths_mm(clean)
+    # Rounding to pixels of 0.2 mm adds 0.08 mm in quadrature.
+    assert np.nanstd(difference) == pytest.approx(np.hypot(SweepErrors().contour_mm, 0.08), rel=0.05)
+    assert abs(np.nanmean(difference)) < 0.02
+
+
+def test_tracking_noise_has_its_size(record):
+    clean, noisy = (record(errors) for errors in (SweepErrors.none(), SweepErrors.only("tracking")))
+    difference = noisy.poses - clean.poses
+    assert difference[:, :3, 3].std() == pytest.approx(0.1, rel=0.05)
+    assert not difference[:, :, :3].any()
+    np.testing.assert_array_equal(noisy.masks, clean.masks)
+
+
+def test_calibration_error_has_its_size(record):
+    sweep = record(SweepErrors.only("calibration"))
+    error = Probe().T_probe_image.inverse @ sweep.T_probe_image
+    middle = np.array([[51 / 2, 35 / 2, 0.0]])
+    assert np.linalg.norm(error.apply(middle) - middle) == pytest.approx(1.0)
+    assert error.angle_deg == pytest.approx(0.3)
+
+
+def test_latency_residual_has_its_size(record):
+    found = {record(SweepErrors.only("latency residual"), seed).latency_s for seed in range(6)}
+    assert found == {LATENCY_S - 0.005, LATENCY_S + 0.005}
+
+
+def test_dropped_frames_and_missed_strips(chest, record, seen):
+    clean = record(SweepErrors.none())
+    dropped = record(SweepErrors.only("dropped frames"))
+    assert dropped.n_frames / clean.n_frames == pytest.approx(0.95, abs=0.02)
+    assert set(dropped.frame_times_s) < set(clean.frame_times_s)
+    fixture = visible_surface(chest, FRONT, 2.0, np.random.default_rng(0)).points
+    strips = sweep_cloud(record(SweepErrors.only("missed strips")))
+    assert surface_distance_mm(strips.cloud.points, seen).mean() < 0.2
+    missed = fixture[KDTree(strips.cloud.points).query(fixture)[0] > 2]
+    assert 0.01 < len(missed) / len(fixture) < 0.15
+
+
+def test_breathing_moves_the_chest_by_its_amplitude():
+    near = box((120, 4, 100))
+    plate = Mesh(near.vertices, near.faces, np.zeros(len(near.vertices)))
+    clean, breath = (
+        simulate_sweep(plate, FRONT, errors, np.random.default_rng(0))
+        for errors in (SweepErrors.none(), SweepErrors.only("breathing"))
+    )
+    difference = depths_mm(breath) - depths_mm(clean)
+    shown = np.nanmedian(difference[np.isfinite(difference).any(axis=1)], axis=1)
+    # 4 mm peak to peak, half-way between head and front; the edges of the plate and pixels of 0.2 mm blur it.
+    ventral_mm = SweepErrors().breathing_mm / np.sqrt(2)
+    assert np.percentile(shown, 97) - np.percentile(shown, 3) == pytest.approx(ventral_mm, abs=0.3)
+    assert abs(shown.mean()) < 0.2  # about the mean position: breathing shifts nothing in the long run
+
+
+@pytest.mark.parametrize("source", ERROR_SOURCES)
+def test_each_source_alone_does_something_and_less_than_it_may(record, seen, source):
+    clean, alone = (record(errors) for errors in (SweepErrors.none(), SweepErrors.only(source)))
+    assert any(
+        not np.array_equal(a, b)
+        for a, b in (
+            (clean.masks, alone.masks),
+            (clean.poses, alone.poses),
+            (clean.T_probe_image.matrix, alone.T_probe_image.matrix),
+            (clean.latency_s, alone.latency_s),
+        )
+    )
+    limit = 4.0 if source == "latency" else 1.2
+    assert surface_distance_mm(sweep_cloud(alone).cloud.points, seen).mean() < limit
+
+
+def test_the_budget_has_every_source_once():
+    cases = error_budget()
+    assert [name for name, _ in cases] == ["none", *ERROR_SOURCES, "all", "all, latency not corrected"]
+    assert len({errors for _, errors in cases}) == len(cases) == 12
+    rows = error_table()
+    assert {row["field"] for row in rows} == {field.name for field in dataclasses.fields(SweepErrors)}
+    assert all(row["unit"] and len(str(row["reason"])) > 20 for row in rows)
+    with pytest.raises(StudyError, match="expected one of latency"):
+        SweepErrors.only("gremlins")
+    for bad in ({"fat_mm": -1.0}, {"dropped": 1.0}, {"breathing_mm": float("nan")}):
+        with pytest.raises(StudyError, match="expected a size"):
+            SweepErrors(**bad)
+
+
+def test_same_seed_same_sweep_and_parts_do_not_leak(chest, record):
+    blind = dataclasses.replace(chest, parts=np.zeros(len(chest.vertices), dtype=int))
+    a, b = record(SweepErrors(), 3), simulate_sweep(blind, FRONT, SweepErrors(), np.random.default_rng(3))
+    np.testing.assert_array_equal(a.masks, b.masks)
+    np.testing.assert_array_equal(a.poses, b.poses)
+    np.testing.assert_array_equal(a.frame_times_s, b.frame_times_s)
+
+
+def test_the_base_frame_moves_the_cloud_and_nothing_else(chest, record):
+    T_base_patient = RigidTransform.random(np.random.default_rng(8))
+    at_home = record(SweepErrors(), 2)
+    away = simulate_sweep(chest, FRONT, SweepErrors(), np.random.default_rng(2), T_base_patient=T_base_patient)
+    np.testing.assert_array_equal(at_home.masks, away.masks)
+    points, _, beam, _ = contour_points(at_home)
+    moved, _, moved_beam, _ = contour_points(away)
+    np.testing.assert_allclose(moved, T_base_patient.apply(points), atol=1e-6)
+    np.testing.assert_allclose(moved_beam, T_base_patient.rotation @ beam, atol=1e-9)
+
+
+def test_another_frame_of_the_patient_sees_the_same(chest):
+    """Front and up are arguments: nothing relies on the axes being right, front and head."""
+    turn = RigidTransform.random(np.random.default_rng(9))
+    rng = np.random.default_rng(2)
+    moved = simulate_sweep(
+        chest.moved(turn), turn.rotation @ FRONT, SweepErrors.none(), rng, up=turn.rotation @ np.array([0.0, 0.0, 1.0])
+    )
+    points = turn.inverse.apply(sweep_cloud(moved).cloud.points)
+    assert surface_distance_mm(points, chest).mean() < 0.2
+
+
+def test_the_picture_is_the_probe_s(record):
+    sweep = record(SweepErrors())
+    assert sweep.masks.shape[1:] == (175, 255)
+    assert np.median(np.diff(sweep.frame_times_s)) == pytest.approx(1 / 30, rel=0.02)
+    assert np.ptp(np.diff(sweep.frame_times_s)) > 0.003  # uneven
+    assert np.diff(sweep.pose_times_s) == pytest.approx(0.01)
+    frames, columns = np.nonzero(sweep.masks.any(axis=1))
+    thickness = sweep.masks.sum(axis=1)[frames, columns]
+    assert np.median(thickness) == 5
+
+
+def test_what_lies_behind_is_not_seen():
+    """A small plate behind a large one leaves no trace in the cloud."""
+    near, far = box((120, 4, 100)), box((40, 4, 40))
+    far.apply_translation((0, -12, 0))
+    both = Mesh(
+        np.vstack([near.vertices, far.vertices]),
+        np.vstack([near.faces, far.faces + len(near.vertices)]),
+        np.repeat([0, 1], [len(near.vertices), len(far.vertices)]),
+    )
+    cloud = sweep_cloud(simulate_sweep(both, FRONT, SweepErrors.none(), np.random.default_rng(0))).cloud.points
+    assert cloud[:, 1].min() > -2.5
+    shown = visible_surface(both, FRONT, 3.0, np.random.default_rng(0))
+    np.testing.assert_allclose(shown.points[:, 1], 2.0, atol=1e-3)
+    assert set(visible_mesh(both, FRONT).parts) == {0}
+
+
+def test_the_fixture_is_even_first_hit_and_labelled(chest):
+    cloud = visible_surface(chest, FRONT, 2.0, np.random.default_rng(1))
+    assert surface_distance_mm(cloud.points, chest).max() < 0.01
+    assert set(cloud.parts) == set(range(9))
+    # Nothing of the posterior half of a tube: 5 mm in front of the axis to 0, none behind.
+    arch = arch_mm(cloud.points[:, 0], cloud.points[:, 2])
+    assert (cloud.points[:, 1] - arch).min() > -1.5
+    spacing = KDTree(cloud.points).query(cloud.points, k=2)[0][:, 1]
+    assert 0.8 < np.median(spacing) < 2.4
+    with pytest.raises(StudyError, match="spacing"):
+        visible_surface(chest, FRONT, 0.0, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize(
+    ("front", "up", "message"),
+    [
+        ((0, 0, 0), (0, 0, 1), "front as a direction"),
+        ((0, np.nan, 0), (0, 0, 1), "front as a direction"),
+        ((0, 1), (0, 0, 1), "front as a direction"),
+        ((0, 1, 0), (0, 1, 0.1), "up and front at an angle"),
+    ],
+)
+def test_wrong_directions_are_refused(chest, front, up, message):
+    with pytest.raises(StudyError, match=message):
+        simulate_sweep(chest, front, SweepErrors(), np.random.default_rng(0), up=up)
+
+
+def test_a_mesh_inside_out_is_refused(chest):
+    flipped = dataclasses.replace(chest, faces=chest.faces[:, ::-1])
+    with pytest.raises(StudyError, match="inside out"):
+        simulate_sweep(flipped, FRONT, SweepErrors(), np.random.default_rng(0))
+
+
+def test_the_simulated_calibration_run_gives_its_latency_back():
+    found = calibrate_latency(*simulate_latency_run(LATENCY_S, np.random.default_rng(0)))
+    assert abs(found.latency_s - LATENCY_S) < 0.005
+
+
+def test_2000_frames_become_a_cloud_in_10_s(chest):
+    slow = Probe(speed_mm_s=5.0)
+    sweep = simulate_sweep(chest, FRONT, SweepErrors(), np.random.default_rng(0), probe=slow)
+    assert sweep.n_frames >= 2000
+    start = time.process_time()  # of every thread: what one core would take
+    sweep_cloud(sweep)
+    assert time.process_time() - start < 10
