@@ -2,10 +2,10 @@
 
     python benchmarks/tune_baselines.py [icp nonrigid_icp cpd] [--out results/tuning]
 
-The development subjects are phantoms of seeds that the study does not report. Each pair starts from a rigid fit of
-its parts' centroids, tilted and shifted at random by as much as a coarse alignment may err, so that a setting that only
-works from a perfect start loses. The best row has the smallest mean true waypoint error, the study's own question
-(transfer by the 20 mm sphere); `Icp.tuned()` and its like hold that row, and a test holds them to the table.
+The development subjects are phantoms of cohort seeds that the study does not report. Each pair starts from the coarse
+alignment, as in the study. The best row has the smallest mean true waypoint error in the feature plane: the study's own
+question (transfer by the 20 mm sphere), without the half cartilage of depth between a tube and its front, which no
+method can see. `Icp.tuned()` and its like hold that row, and a test holds them to the table.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from study import phantom
+from study.coarse import align
 from study.errors import StudyError
-from study.geometry import fit_rigid
+from study.geometry import principal_axes
 from study.methods.cpd import Cpd
 from study.methods.icp import Icp
 from study.methods.nonrigid_icp import NonrigidIcp
 from study.metrics import hausdorff_mm, point_errors_mm
-from study.types import Floats, Method, Part, PointCloud, RigidTransform
+from study.types import Floats, Method, PointCloud
 
-PAIRS = (("ct1", 101), ("ct2", 102), ("ct3", 103))  # source subject and cohort seed; the target is its "patient"
-TILT_DEG, SHIFT_MM = 5.0, 5.0
+PAIRS = (("ct1", 102), ("ct2", 103), ("ct3", 104))  # source subject and cohort seed; the target is its "patient"
+MEASURES = ("waypoint_error_inplane_mm", "waypoint_error_mm", "true_error_mm", "hd_mm", "converged")
 
 
 @dataclass(frozen=True)
@@ -45,19 +45,19 @@ class Case:
     waypoints: Floats
     true_waypoints: Floats
 
+    @property
+    def normal(self) -> Floats:
+        """Normal (3,) of the target's feature plane."""
+        return principal_axes(self.target.points)[1][2]
+
 
 def development_case(name: str, seed: int) -> Case:
     rng = np.random.default_rng([seed, 1])
     ct, us = phantom.draw_subject(name, seed), phantom.draw_subject("patient", seed)
     source = phantom.reference_cloud(ct, 9000, rng)
     target = phantom.anterior_cloud(us, 6600, 0.5, 4, rng)
-    parts = [part for part in Part if part != Part.UNKNOWN]
-    fit = fit_rigid(*(np.array([cloud.only(part).mean(axis=0) for part in parts]) for cloud in (source, target)))
-    centre = target.points.mean(axis=0)
-    axis, shift = rng.normal(size=(2, 3))
-    tilt = Rotation.from_rotvec(np.radians(TILT_DEG) * axis / np.linalg.norm(axis)).as_matrix()
-    off = RigidTransform(tilt, centre - tilt @ centre + SHIFT_MM * shift / np.linalg.norm(shift))
-    start = off @ fit
+    # As in the study, nothing but the points goes into the coarse alignment.
+    start = align(PointCloud(source.points, source.name), PointCloud(target.points, target.name)).T_us_ct
     return Case(
         name=f"{name}@{seed}",
         source=source.moved(start),
@@ -81,7 +81,7 @@ def grid(name: str) -> Iterator[Method]:
             yield Icp(max_distance_mm=distance, point_to_plane=plane, max_iterations=200)
     elif name == "nonrigid_icp":
         yield NonrigidIcp()
-        for stiffest, threshold in product((0.03, 0.1, 0.3, 1.0, 3.0), (0.03, 0.05, 0.1)):
+        for stiffest, threshold in product((0.01, 0.03, 0.1, 0.3), (0.05, 0.1, 0.2)):
             yield NonrigidIcp(steps=amberg_steps(stiffest), distance_threshold=threshold)
     elif name == "cpd":
         yield Cpd()
@@ -101,6 +101,7 @@ def run_grid(methods: Iterable[Method], cases: list[Case]) -> pd.DataFrame:
                 result = method.register(case.source, case.target, np.random.default_rng(0))
                 moved = result.transfer(case.waypoints)
                 row |= {
+                    "waypoint_error_inplane_mm": point_errors_mm(moved, case.true_waypoints, case.normal).mean(),
                     "waypoint_error_mm": point_errors_mm(moved, case.true_waypoints).mean(),
                     "true_error_mm": point_errors_mm(result.warped, case.truth).mean(),
                     "hd_mm": hausdorff_mm(result.warped, case.target.points),
@@ -109,21 +110,23 @@ def run_grid(methods: Iterable[Method], cases: list[Case]) -> pd.DataFrame:
                     "status": "ok",
                 }
                 seconds = result.seconds
-            except StudyError as error:
-                row["status"], seconds = str(error), float("nan")
+            except StudyError as failure:
+                row["status"], seconds = str(failure), float("nan")
             rows.append(row)
-            print(f"{method.name} {setting:3d} {case.name:9s} {row.get('waypoint_error_mm', 'failed')} {seconds:.1f} s", flush=True)
+            error = row.get("waypoint_error_inplane_mm", "failed")
+            print(f"{method.name} {setting:3d} {case.name:9s} {error} {seconds:.1f} s", flush=True)
     return pd.DataFrame(rows)
 
 
 def summarise(table: pd.DataFrame) -> pd.DataFrame:
     """Mean over the cases, best setting first; a setting that failed on a case cannot be the best."""
-    parameters = list(table.columns[2 : table.columns.get_loc("waypoint_error_mm")])
+    parameters = list(table.columns[2 : table.columns.get_loc("waypoint_error_inplane_mm")])
     summary = table.assign(failed=table["status"] != "ok").groupby("setting", as_index=False).agg(
         {name: "first" for name in parameters}
-        | {"waypoint_error_mm": "mean", "true_error_mm": "mean", "hd_mm": "mean", "converged": "mean", "failed": "sum"}
+        | dict.fromkeys(MEASURES, "mean")
+        | {"failed": "sum"}
     )
-    return summary.sort_values(["failed", "waypoint_error_mm"], kind="stable")
+    return summary.sort_values(["failed", "waypoint_error_inplane_mm"], kind="stable")
 
 
 def main() -> None:
@@ -134,9 +137,9 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     cases = [development_case(name, seed) for name, seed in PAIRS]
     for case in cases:
-        waypoints = point_errors_mm(case.waypoints, case.true_waypoints).mean()
+        waypoints = point_errors_mm(case.waypoints, case.true_waypoints, case.normal).mean()
         points = point_errors_mm(case.source.points, case.truth).mean()
-        print(f"start {case.name}: waypoints {waypoints:.2f} mm, points {points:.2f} mm")
+        print(f"start {case.name}: waypoints {waypoints:.2f} mm in the plane, points {points:.2f} mm")
     for name in options.methods:
         summary = summarise(run_grid(grid(name), cases))
         summary.to_csv(options.out / f"{name}.csv", index=False, lineterminator="\n")

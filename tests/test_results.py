@@ -142,11 +142,14 @@ def test_what_cannot_be_read_is_not_written(tmp_path):
 def test_hd_table_has_the_shape_of_table_1(run):
     metrics = read_metrics(run("a", some_rows(without=[("ct2", "icp")])) / "metrics.csv")
     table = hd_table(metrics)
-    assert list(table.columns) == ["ct1", "ct2", "ct10", "mean", "sd", "n", "n_failed"]
+    assert list(table.columns) == ["ct1", "ct2", "ct10", "mean", "sd", "n", "n_failed", "n_not_converged"]
     hd = metrics[metrics["metric"] == "hd"].set_index(["method", "subject"])["value"]
     assert table.loc["icp", "ct10"] == hd["icp", "ct10"]
     assert table.loc["skeleton_graph", "sd"] == pytest.approx(hd["skeleton_graph"].std(ddof=0))
-    assert list(table.loc["icp", ["n", "n_failed"]]) == [2, 1]
+    assert list(table.loc["icp", ["n", "n_failed", "n_not_converged"]]) == [2, 1, 2]
+    display, _ = beside_paper(table)
+    ours = display[display["Data"] == "this study"].set_index("Method")["n"]
+    assert dict(ours) == {"skeleton_graph": "3", "icp": "2 (1 failed, 2 not converged)"}
     assert np.isnan(table.loc["icp", "ct2"])
     errors = hd_table(metrics, "waypoint_error")
     every = metrics[(metrics["metric"] == "waypoint_error") & (metrics["method"] == "icp")]

@@ -26,6 +26,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from study.errors import StudyError
+from study.methods import METHODS
 from study.metrics import METRICS, population_sd
 
 KEY = ("dataset", "subject", "target", "method", "seed", "metric", "index")
@@ -280,6 +281,12 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
+def _in_order(methods: Iterable[str]) -> list[str]:
+    """Each method once, as ``METHODS`` lists them, those it does not know last."""
+    known = list(METHODS)
+    return sorted(dict.fromkeys(methods), key=lambda name: known.index(name) if name in known else len(known))
+
+
 def _one_dataset(metrics: pd.DataFrame) -> None:
     datasets = sorted(metrics["dataset"].unique())
     if len(datasets) != 1:
@@ -294,8 +301,8 @@ def hd_table(metrics: pd.DataFrame, metric: str = "hd") -> pd.DataFrame:
         metric: also any other of ``METRICS``; several values of a subject (waypoints, seeds, targets) are averaged.
 
     Returns:
-        index method, in order of appearance; a column per subject, NaN where it failed, then ``mean``, ``sd``
-        (population, over subjects), ``n`` (subjects with a value), ``n_failed`` (failed cases).
+        index method, in the order of ``METHODS``; a column per subject, NaN where it failed, then ``mean``, ``sd``
+        (population, over subjects), ``n`` (subjects with a value), ``n_failed`` and ``n_not_converged`` (cases).
 
     Raises:
         StudyError: several datasets, or no row of that metric.
@@ -306,7 +313,7 @@ def hd_table(metrics: pd.DataFrame, metric: str = "hd") -> pd.DataFrame:
     if chosen.empty and failed.empty:
         raise StudyError(f"expected rows of metric {metric!r}, got {sorted(metrics['metric'].unique())}")
     cases = pd.concat([chosen, failed])
-    methods = list(dict.fromkeys(metrics.loc[cases.index.sort_values(), "method"]))
+    methods = _in_order(cases["method"])
     subjects = sorted(cases["subject"].unique(), key=_natural)
     table = chosen.pivot_table(index="method", columns="subject", values="value", aggfunc="mean")
     table = table.reindex(index=methods, columns=subjects).rename_axis(columns=None)
@@ -315,7 +322,9 @@ def hd_table(metrics: pd.DataFrame, metric: str = "hd") -> pd.DataFrame:
     table["mean"] = [row.mean() if row.size else np.nan for row in some]
     table["sd"] = [population_sd(row) if row.size else np.nan for row in some]
     table["n"] = [row.size for row in some]
-    table["n_failed"] = failed.groupby("method").size().reindex(methods, fill_value=0).astype(np.int64)
+    stuck = chosen[chosen["status"] == NOT_CONVERGED].drop_duplicates(list(KEY[:5]))
+    for name, rows in (("n_failed", failed), ("n_not_converged", stuck)):
+        table[name] = rows.groupby("method").size().reindex(methods, fill_value=0).astype(np.int64)
     return table
 
 
@@ -342,14 +351,16 @@ def beside_paper(table: pd.DataFrame, paper: pd.DataFrame | None = None) -> tupl
         columns ``Data``, ``Method``, ``CT 1`` ..., ``Mean±SD``, ``n``, all text; and the note.
     """
     paper = paper_hd_table() if paper is None else paper
-    subjects = [name for name in table.columns if name not in ("mean", "sd", "n", "n_failed")]
+    subjects = list(table.columns[: table.columns.get_loc("mean")])
     theirs = [name for name in paper.columns if name.startswith("CT ")]
     columns = [f"CT {k + 1}" for k in range(max(len(subjects), len(theirs)))]
     rows = []
     for method, row in table.iterrows():
         empty = "failed" if row["n_failed"] else "–"
         cells = [_mm(row[name], empty) for name in subjects]
-        done = f"{int(row['n'])}" + (f" ({int(row['n_failed'])} failed)" if row["n_failed"] else "")
+        counts = {"failed": row["n_failed"], "not converged": row["n_not_converged"]}
+        remarks = ", ".join(f"{int(count)} {what}" for what, count in counts.items() if count)
+        done = f"{int(row['n'])}" + (f" ({remarks})" if remarks else "")
         rows.append(["this study", str(method), cells, _mean_sd(row["mean"], row["sd"], empty), done])
     for method, row in paper.iterrows():
         cells = [_mm(row[name], "–") for name in theirs]
@@ -389,7 +400,7 @@ def write_hd_table(metrics: pd.DataFrame, stem: Path, metric: str = "hd", captio
     caption = caption or f"{METRICS[metric].title} of the methods"
     full = table.assign(data="this study").set_index("data", append=True)
     if not paper.empty:
-        full = pd.concat([full, paper.assign(data=PAPER_DATA).set_index("data", append=True)])
+        full = pd.concat([full.convert_dtypes(), paper.assign(data=PAPER_DATA).set_index("data", append=True)])
     write_text(stem.with_suffix(".csv"), full.to_csv(lineterminator="\n"))
     write_markdown(display, stem.with_suffix(".md"), caption, note)
     write_latex(display, stem.with_suffix(".tex"), caption, note)
@@ -432,7 +443,7 @@ def waypoint_summary(metrics: pd.DataFrame) -> pd.DataFrame:
     failed = metrics[metrics["metric"] == CASE].groupby("method").size()
     paper = paper_waypoints()
     rows = []
-    kinds, methods = chosen["metric"].unique(), metrics["method"].unique()
+    kinds, methods = chosen["metric"].unique(), _in_order(metrics["method"])
     for metric in sorted(kinds, key=list(METRICS).index):
         for method in methods:
             mine = chosen[(chosen["metric"] == metric) & (chosen["method"] == method)]
@@ -448,8 +459,8 @@ def waypoint_summary(metrics: pd.DataFrame) -> pd.DataFrame:
                 "n_waypoints": values.size,
                 "n_cases": len(mine.drop_duplicates(list(KEY[:5]))),
                 "n_failed": int(failed.get(method, 0)),
-                "paper_mean": float(paper.loc[method, "mean"]) if reported else np.nan,
-                "paper_sd": float(paper.loc[method, "sd"]) if reported else np.nan,
+                "paper_mean": paper["mean"].get(method) if reported else np.nan,
+                "paper_sd": paper["sd"].get(method) if reported else np.nan,
             })
     return pd.DataFrame(rows)
 
