@@ -41,6 +41,7 @@ class Request:
     first: int | None
     last: int | None
     user_agent: str
+    authorization: str
     sent: int = 0
 
 
@@ -89,7 +90,9 @@ class ArchiveServer:
         asked = re.fullmatch(r"bytes=(\d*)-(\d*)", handler.headers.get("Range", ""))
         fault = self.faults.popleft() if self.faults else Fault()
         body = self.files.get(handler.path)
-        request = Request(handler.path, None, None, handler.headers.get("User-Agent", ""))
+        request = Request(
+            handler.path, None, None, handler.headers.get("User-Agent", ""), handler.headers.get("Authorization", "")
+        )
         self.requests.append(request)
         if body is None or fault.status is not None:
             handler.send_response(fault.status or 404)

@@ -324,6 +324,18 @@ def test_an_interrupted_fetch_keeps_what_it_has(write: Write, monkeypatch: pytes
     assert fetch(manifest.file("ct"), web=FAST).read_bytes() == noise(1)
 
 
+def test_a_part_of_another_version_is_not_continued(
+    write: Write, server: ArchiveServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest = write(ribfrac_zip({421: noise(1)}), "RibFrac421-image.nii.gz")
+    with monkeypatch.context() as patch:
+        patch.setattr(Web, "_append", _interrupt_after(Web._append, 2))
+        with pytest.raises(KeyboardInterrupt):
+            fetch(manifest.file("ct"), web=FAST)
+    server.files[RIBFRAC_PATH] = ribfrac_zip({421: noise(2)})
+    assert fetch(manifest.file("ct"), web=FAST).read_bytes() == noise(2)
+
+
 def _interrupt_after(append: Callable[..., None], n_calls: int) -> Callable[..., None]:
     calls = []
 
@@ -503,7 +515,7 @@ def publish(tmp_path: Path, server: ArchiveServer, monkeypatch: pytest.MonkeyPat
     def make(
         packed: bytes, member: str, *, archive: str = "scans-1.0.tar.gz", sha256: str = "", **file: object
     ) -> Manifest:
-        server.files["/simple/scans/"] = f'<a href="/files/{archive}">{archive}</a>'.encode()
+        server.files["/simple/scans/"] = f'<a href="{server.url}/files/{archive}">{archive}</a>'.encode()
         server.files[f"/files/{archive}"] = packed
         monkeypatch.setenv("PIP_INDEX_URL", f"{server.url}/simple/")
         source = {
@@ -581,6 +593,8 @@ def test_a_member_that_is_not_the_one_meant_is_refused(publish: Write, folder: P
     with pytest.raises(StudyError, match=r"expected sha256 [0-9a-f]{64}, got [0-9a-f]{64}"):
         fetch(manifest.file("ct"), web=FAST)
     assert not list(folder.rglob("a.nrrd*"))
+    with pytest.raises(StudyError, match=r"expected 300001 bytes, got 300000"):
+        fetch(publish(sdist({"a.nrrd": noise(1)}), "a.nrrd", bytes=300_001).file("ct"), web=FAST)
     for packed in (sdist({}, {"a.nrrd": "/etc/passwd"}), sdist({"../a.nrrd": noise(1)}), noise(3)):
         with pytest.raises(StudyError, match=r"link|not safe|sound"):
             fetch(publish(packed, "a.nrrd").file("ct"), web=FAST)
@@ -592,6 +606,8 @@ def test_an_index_without_the_file_is_named_without_its_password(
     manifest = publish(sdist({"a.nrrd": noise(1)}), "a.nrrd")
     monkeypatch.setenv("PIP_INDEX_URL", server.url.replace("://", "://me:secret@") + "/simple/")
     assert fetch(manifest.file("ct"), web=FAST).exists()
+    assert len(server.requests) == 2
+    assert all(request.authorization.startswith("Basic ") for request in server.requests)  # the file needs it as well
     for page in (b"<a href='other-1.0.tar.gz'>other-1.0.tar.gz</a>", None):
         if page is None:
             del server.files["/simple/scans/"]

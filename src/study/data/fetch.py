@@ -7,7 +7,7 @@ import hashlib
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import date
 from functools import lru_cache
@@ -110,7 +110,7 @@ def status(file: DataFile) -> str:
 
 def data_list(manifest: Manifest, dataset: str | None = None) -> pd.DataFrame:
     """Every file of a cohort (or of all) with its source, licence and status, one row each, see `COLUMNS`."""
-    return _table(manifest, dataset, lambda file: status(file))
+    return _table(manifest, dataset, status)
 
 
 def fetch_all(
@@ -167,7 +167,7 @@ def _fetch_absent(files: list[DataFile], progress: bool, web: Web | None) -> lis
     return [path_of(file) for file in files]
 
 
-def _table(manifest: Manifest, dataset: str | None, state: Any) -> pd.DataFrame:
+def _table(manifest: Manifest, dataset: str | None, state: Callable[[DataFile], str]) -> pd.DataFrame:
     rows = []
     for name in [dataset] if dataset is not None else list(manifest.cohorts):
         for key, subject in manifest.cohort(name).subjects.items():
@@ -180,10 +180,8 @@ def _table(manifest: Manifest, dataset: str | None, state: Any) -> pd.DataFrame:
                         origin = shown(source.url)
                     case LocalSource():
                         origin = source.path
-                known = (file.bytes, file.licence or "", file.title or "", str(path_of(file)))
-                size, licence, title, path = known
-                row = (name, key, file.role, file.key, state(file), size, origin, licence, title, path)
-                rows.append(dict(zip(COLUMNS, row, strict=True)))
+                known = (file.bytes, origin, file.licence or "", file.title or "", str(path_of(file)))
+                rows.append((name, key, file.role, file.key, state(file), *known))
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"bytes": "Int64"})
 
 
@@ -194,9 +192,11 @@ class _Fetcher:
         self.web = web
         self.progress = progress
         self._remote: dict[str, RemoteArchive] = {}
+        self._n_files = self._n_begun = 0
 
     def announce(self, files: list[DataFile]) -> None:
         """Say how much will be fetched, and refuse at once when the disk can't hold it."""
+        self._n_files = len(files)
         downloads: dict[Path, int] = {}
         n_disk = 0
         for file in files:
@@ -226,6 +226,7 @@ class _Fetcher:
 
     def fetch(self, file: DataFile) -> Path:
         """Get one file from its source, checked against the manifest or the lock file, or record its hash there."""
+        self._n_begun += 1
         path = path_of(file)
         sha256, recorded = _known_sha256(file)
         try:
@@ -306,9 +307,15 @@ class _Fetcher:
     def _bar(self, name: str, n_bytes: int) -> tqdm:
         quiet = not sys.stderr.isatty()  # a log file needs a line now and then, not a moving bar
         return tqdm(
-            total=n_bytes, desc=Path(name).name, unit="B", unit_scale=True, unit_divisor=1024, file=sys.stderr,
-            mininterval=10 if quiet else 0.2, disable=not self.progress,
-        )  # fmt: skip
+            total=n_bytes,
+            desc=f"{self._n_begun}/{self._n_files} {Path(name).name}",
+            unit="B",
+            unit_scale=True,
+            unit_divisor=1024,
+            file=sys.stderr,
+            mininterval=10 if quiet else 0.2,
+            disable=not self.progress,
+        )
 
     def say(self, line: str) -> None:
         """Tell the user, above any bar."""

@@ -68,12 +68,14 @@ class RemoteArchive:
             raise StudyError(f"{where}: expected {n_bytes} bytes, got {info.file_size}; the archive has changed")
         part = part_of(target, info)
         self.web.download(self.url, part, self._stored_bytes(info), offset=info.header_offset, bar=bar)
+        content = _inflated(part, info, where)
         try:
-            return write_checked(
-                _inflated(part, info, where), target, n_bytes=info.file_size, crc32=info.CRC, sha256=sha256, where=where
-            )
-        finally:
+            found = write_checked(content, target, n_bytes=info.file_size, crc32=info.CRC, sha256=sha256, where=where)
+        except StudyError:
             part.unlink()
+            raise
+        part.unlink()
+        return found
 
     def _stored_bytes(self, info: zipfile.ZipInfo) -> int:
         """An upper bound on header and data: the way to the next member, or to the archive's end.
