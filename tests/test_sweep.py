@@ -273,6 +273,9 @@ def test_what_lies_behind_is_not_seen():
     )
     cloud = sweep_cloud(simulate_sweep(both, FRONT, SweepErrors.none(), np.random.default_rng(0))).cloud.points
     assert cloud[:, 1].min() > -2.5
+    # Rounding to pixels must not push the surface up or down: a whole pixel would be 0.2 mm.
+    middle = cloud[(np.abs(cloud[:, 0]) < 50) & (np.abs(cloud[:, 2]) < 40)]
+    assert middle[:, 1].mean() == pytest.approx(2.0, abs=0.03)
     shown = visible_surface(both, FRONT, 3.0, np.random.default_rng(0))
     np.testing.assert_allclose(shown.points[:, 1], 2.0, atol=1e-3)
     assert set(visible_mesh(both, FRONT).parts) == {0}
