@@ -11,6 +11,7 @@ import open3d as o3d
 from threadpoolctl import threadpool_limits
 
 from study.errors import StudyError
+from study.geometry import principal_axes
 from study.types import Floats, PointCloud, Registration, RigidTransform
 
 
@@ -51,11 +52,15 @@ class Icp:
             StudyError: no target point within ``max_distance_mm`` of any source point.
         """
         start = perf_counter()
-        # With two threads Open3D adds its pairs up in the order in which the threads finish: the last bits change
+        # Its point-to-plane update turns about the origin in small angles, so it runs in the source's own axes: the
+        # answer does not depend on where a tracker has its origin.
+        centre, axes = principal_axes(source.points)
+        T_axes = RigidTransform(axes, -axes @ centre)
+        # With two threads Open3D adds its pairs up in the order in which the threads finish: the last bits would change
         # from run to run.
         with threadpool_limits(limits=1):
-            matrix, history, converged = self._run(source.points, target.points)
-        T_us_ct = RigidTransform.from_matrix(matrix)
+            matrix, history, converged = self._run(T_axes.apply(source.points), T_axes.apply(target.points))
+        T_us_ct = T_axes.inverse @ RigidTransform.from_matrix(matrix) @ T_axes
         limit = f"iteration limit of {self.max_iterations} reached"
         return Registration(
             source=source.points,

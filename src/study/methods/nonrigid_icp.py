@@ -22,6 +22,7 @@ Step = tuple[float, float, float, int]  # smoothness, landmark weight, exponent 
 _NORMAL_NEIGHBOURS = 10
 _BALL_RADII = (1.0, 1.5, 2.0)  # in spacings: small ones first, so that no ball rolls over an intercostal gap
 _MIN_PIECE = 20  # vertices; smaller pieces of surface have too few partners to be fitted
+_MIN_HELD = 4  # vertices with a partner that fix a piece's affine map
 
 
 @dataclass(frozen=True)
@@ -79,10 +80,11 @@ class NonrigidIcp:
         moving, fixed = (source.points - centre) @ axes.T, (target.points - centre) @ axes.T
         with threadpool_limits(limits=1):  # sums of a threaded BLAS depend on the number of threads
             vertices, faces = _surface(moving, self.max_vertices, source.name)
+            self._require_partners(vertices, faces, fixed, source.name)
             records = self._bend(trimesh.Trimesh(vertices, faces, process=False), fixed)
             if not np.isfinite(records[-1]).all():
                 raise StudyError(
-                    f"nonrigid_icp: expected a solution for {source.name!r}, got NaN; some piece of it has no partner: "
+                    f"nonrigid_icp: expected a solution for {source.name!r}, got NaN; "
                     "raise distance_threshold or the smoothness in steps"
                 )
             warped = moving + _carry(records[-1] - vertices, vertices, faces, moving)
@@ -102,6 +104,17 @@ class NonrigidIcp:
             method=self.name,
             extras={"n_vertices": len(vertices), "n_faces": len(faces)},
         )
+
+    def _require_partners(self, vertices: Floats, faces: Ints, target: Floats, name: str) -> None:
+        """Refuse a piece of surface that nothing holds: its equations are singular and their solution arbitrary."""
+        piece = trimesh.graph.connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(vertices))
+        near = KDTree(target).query(vertices)[0] <= self.distance_threshold * np.linalg.norm(np.ptp(vertices, axis=0))
+        held = np.bincount(piece, weights=near)
+        if held.min() < _MIN_HELD:
+            raise StudyError(
+                f"nonrigid_icp: expected every piece of {name!r} to have target points within reach, got {held.min():.0f} "
+                f"vertices of one; check the coarse alignment or raise distance_threshold"
+            )
 
     def _bend(self, mesh: trimesh.Trimesh, target: Floats) -> list[Floats]:
         return trimesh.registration.nricp_amberg(

@@ -1,0 +1,208 @@
+"""Cohorts: who is the atlas, who is the patient, and what is known of the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from study import phantom
+from study.cartilage_growth import parts_from_landmarks, parts_from_ribs
+from study.ct import check_field_of_view, parts_from_labels, sample_cloud, surface
+from study.data.fetch import fetch
+from study.data.landmarks import read_landmarks
+from study.data.manifest import Manifest, Subject, load_manifest
+from study.data.volumes import read_labels, read_masks, read_volume
+from study.deform import planted_deformation
+from study.errors import StudyError
+from study.params import PHANTOM_SEED, StudyParams
+from study.pipeline import named_rng
+from study.sweep import SweepErrors, simulate_sweep, true_parts
+from study.types import Floats, Mesh, PointCloud, RigidTransform, Volume, Waypoints
+from study.us import SweepReport, sweep_cloud
+from study.waypoints import intercostal_waypoints
+
+FRONT = np.array([0.0, 1.0, 0.0])  # RAS+: anterior
+PLANTED_SOURCE = ("open", "lidc-0001")
+PLANTED_SIZES_MM: Mapping[str, float] = {  # mean distance after a rigid fit, as between people
+    "planted1": 5.0,
+    "planted2": 6.0,
+    "planted3": 7.0,
+    "planted4": 8.0,
+    "planted5": 9.0,
+}
+TruthMap = Callable[[Floats], Floats]
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """One person's sternum and cartilages, from a CT (sec. II-C.1).
+
+    Attributes:
+        name: of the subject.
+        mesh: surface with parts, RAS+ mm.
+        cloud: Poisson-disc samples of it, labelled.
+        waypoints: the 20 waypoints: exact on the phantom, else by the paper's protocol on the labelled cloud.
+        image, mask: the CT and its `Part` volume; None for a planted deformation, which has no image of its own.
+    """
+
+    name: str
+    mesh: Mesh
+    cloud: PointCloud
+    waypoints: Waypoints
+    image: Volume | None = None
+    mask: Volume | None = None
+
+
+@dataclass(frozen=True)
+class Patient:
+    """A simulated patient: what a virtual sweep sees of an anatomy.
+
+    Attributes:
+        anatomy: the truth, RAS+.
+        cloud: the US cloud in the tracker's base frame; it knows its front, not its parts.
+        labelled: the same cloud with the parts of the nearest true surface, as the paper's manual segmentation.
+        T_us_ras: RAS+ to the tracker's base frame.
+        report: frames used and dropped.
+    """
+
+    anatomy: Anatomy
+    cloud: PointCloud
+    labelled: PointCloud
+    T_us_ras: RigidTransform
+    report: SweepReport
+
+
+def pairs(dataset: str, params: StudyParams, manifest: Manifest | None = None) -> list[tuple[str, str]]:
+    """The (CT, patient) pairs of a dataset.
+
+    The phantom has one patient, as the paper; in the open cohorts each subject in turn is the patient of all others.
+
+    Raises:
+        StudyError: no such dataset.
+    """
+    if dataset == "planted":
+        sources, targets = [PLANTED_SOURCE[1]], list(PLANTED_SIZES_MM)
+    else:
+        subjects = (manifest or load_manifest()).cohort(dataset).subjects
+        sources = [name for name, subject in subjects.items() if subject.role in ("ct", "any")]
+        targets = [name for name, subject in subjects.items() if subject.role in ("patient", "any")]
+    if params.max_targets:
+        targets = targets[: params.max_targets]
+    chosen = []
+    for target in targets:
+        others = [source for source in sources if source != target]
+        chosen += [(source, target) for source in others[: params.max_sources or None]]
+    if not chosen:
+        raise StudyError(f"dataset {dataset!r}: expected at least two subjects, one of them a patient; got none to pair")
+    return chosen
+
+
+def load_anatomy(
+    dataset: str, name: str, params: StudyParams, seed: int = 0, manifest: Manifest | None = None
+) -> Anatomy:
+    """One subject's surface and cloud, fetched or generated (sec. II-C.1).
+
+    Raises:
+        StudyError: an unknown name, a failed download, or an image without the anatomy.
+    """
+    rng = named_rng(seed, f"{dataset}/{name}/anatomy")
+    if dataset == "planted" and name in PLANTED_SIZES_MM:
+        return _planted(name, params, seed, manifest)
+    if dataset == "planted":
+        dataset = PLANTED_SOURCE[0]
+    manifest = manifest or load_manifest()
+    cohort = manifest.cohort(dataset)
+    if name not in cohort.subjects:
+        raise StudyError(f"expected a subject among {', '.join(cohort.subjects)}, got {name!r}")
+    if cohort.kind == "generated":
+        drawn = phantom.draw_subject(name, PHANTOM_SEED)
+        image, labels = phantom.ct_volume(drawn, params.phantom_spacing_mm, named_rng(PHANTOM_SEED, f"ct/{name}"))
+        ids = {structure: label for label, structure in manifest.label_map("totalsegmentator_v2").items()}
+        mask = parts_from_labels(labels, ids)
+    else:
+        image, mask = _read(manifest, cohort.subjects[name])
+    mesh = replace(surface(mask), name=name)
+    cloud = replace(sample_cloud(mesh, params.ct_points, rng), name=f"ct:{name}")
+    exact = phantom.waypoints(drawn) if cohort.kind == "generated" else intercostal_waypoints(cloud)
+    return Anatomy(name, mesh, cloud, exact, image, mask)
+
+
+def _read(manifest: Manifest, subject: Subject) -> tuple[Volume, Volume]:
+    """The CT and its mask of parts, from labels, rib labels or landmarks."""
+    if subject.ct is None:
+        raise StudyError(f"{manifest.path.name}: expected a ct for every subject of a file cohort, got none")
+    image = read_volume(fetch(manifest.file(subject.ct)))
+    chosen = subject.labels or subject.rib_labels
+    landmarks = manifest.landmarks_path(subject)
+    if chosen is not None:
+        file = manifest.file(chosen.file)
+        if file.is_family:
+            paths = {mask.key.partition("/")[2]: fetch(mask) for mask in manifest.masks(chosen).values()}
+            labels, ids = read_masks(paths, image)
+        else:
+            labels = read_labels(fetch(file), image)
+            ids = {structure: label for label, structure in manifest.label_map(chosen.map).items()}
+        mask = parts_from_labels(labels, ids) if subject.labels else parts_from_ribs(image, labels, ids)
+    elif landmarks is not None:
+        mask = parts_from_landmarks(image, read_landmarks(landmarks))
+    else:
+        raise StudyError(
+            f"{manifest.path.name}: expected labels, rib_labels or landmarks for {subject.title or subject.ct!r}, "
+            "got none; without them cartilage cannot be told from muscle"
+        )
+    check_field_of_view(mask, image)
+    return image, mask
+
+
+def _planted(name: str, params: StudyParams, seed: int, manifest: Manifest | None) -> Anatomy:
+    """The source anatomy under a known smooth deformation."""
+    source = load_anatomy(*PLANTED_SOURCE, params, seed, manifest)
+    deform = _plant(source.mesh, name)
+    mesh = replace(source.mesh, vertices=deform(source.mesh.vertices), name=name)
+    cloud = replace(source.cloud, points=deform(source.cloud.points), name=f"ct:{name}")
+    waypoints = replace(source.waypoints, points=deform(source.waypoints.points))
+    return Anatomy(name, mesh, cloud, waypoints)
+
+
+def _plant(mesh: Mesh, name: str) -> TruthMap:
+    return planted_deformation(mesh.vertices, PLANTED_SIZES_MM[name], named_rng(0, f"planted/{name}")).apply
+
+
+def truth_map(dataset: str, source: Anatomy, target: str) -> TruthMap | None:
+    """Where each point of the source anatomy truly lies in the target's, both RAS+; None between two real people."""
+    if dataset == "phantom":
+        one, other = (phantom.draw_subject(name, PHANTOM_SEED) for name in (source.name, target))
+        return partial(phantom.truth_map, one, other)
+    if dataset == "planted":
+        return _plant(source.mesh, target)
+    return None
+
+
+def make_patient(
+    anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: SweepErrors | None = None
+) -> Patient:
+    """Sweep an anatomy with a virtual tracked probe whose base frame is anywhere (sec. II-C.2).
+
+    Args:
+        anatomy: the person on the couch.
+        params: density of the cloud.
+        seed: of the hand, the errors and the base frame.
+        errors: what goes wrong; every source at its default size when None.
+    """
+    rng = named_rng(seed, f"{anatomy.name}/sweep")
+    T_us_ras = RigidTransform.random(named_rng(seed, f"{anatomy.name}/base"))
+    sweep = simulate_sweep(
+        anatomy.mesh,
+        FRONT,
+        SweepErrors() if errors is None else errors,
+        rng,
+        T_base_patient=T_us_ras,
+        name=f"us:{anatomy.name}",
+    )
+    seen = sweep_cloud(sweep, spacing_mm=params.us_spacing_mm)
+    cloud = replace(seen.cloud, front=seen.front)
+    labelled = replace(cloud, parts=true_parts(T_us_ras.inverse.apply(cloud.points), anatomy.mesh))
+    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report)

@@ -1,0 +1,70 @@
+"""Parameters of a run, and the profiles that name them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
+from typing import Any
+
+from study.errors import StudyError
+
+PHANTOM_SEED = 1  # draws the reported phantom anatomies; their mean distance after a rigid fit lies in 5-10 mm
+DEVELOPMENT_SEED = 101  # draws the anatomies that parameters may be tuned on; none of them is ever reported
+
+
+@dataclass(frozen=True)
+class StudyParams:
+    """How much of a cohort is run, and how finely.
+
+    Attributes:
+        ct_points: points of a CT cloud (about 9,000 in the authors' data).
+        us_spacing_mm: distance between neighbouring points of a US cloud.
+        phantom_spacing_mm: voxel of the phantom's CT volumes.
+        max_sources: CTs per patient, from the first; 0 for all.
+        max_targets: patients, from the first; 0 for all.
+        radius_mm: sphere of path transfer (sec. III-D).
+    """
+
+    ct_points: int = 9000
+    us_spacing_mm: float = 1.5
+    phantom_spacing_mm: float = 1.5
+    max_sources: int = 0
+    max_targets: int = 0
+    radius_mm: float = 20.0
+
+    def __post_init__(self) -> None:
+        if self.ct_points < 500 or min(self.us_spacing_mm, self.phantom_spacing_mm, self.radius_mm) <= 0:
+            raise StudyError(f"expected ct_points >= 500 and positive lengths, got {self}")
+
+
+PROFILES: Mapping[str, StudyParams] = MappingProxyType(
+    {
+        "full": StudyParams(),
+        "quick": StudyParams(ct_points=3000, us_spacing_mm=2.5, phantom_spacing_mm=2.5, max_sources=2, max_targets=1),
+    }
+)
+
+
+def find_profile(name: str) -> StudyParams:
+    """The profile called ``name``.
+
+    Raises:
+        StudyError: no such profile.
+    """
+    if name not in PROFILES:
+        raise StudyError(f"expected a profile among {', '.join(PROFILES)}, got {name!r}")
+    return PROFILES[name]
+
+
+def override(params: StudyParams, **changes: Any) -> StudyParams:
+    """The same parameters with some replaced.
+
+    Raises:
+        StudyError: an unknown name.
+    """
+    known = {entry.name for entry in fields(params)}
+    unknown = sorted(set(changes) - known)
+    if unknown:
+        raise StudyError(f"expected parameters among {', '.join(sorted(known))}, got {', '.join(unknown)}")
+    return replace(params, **changes)
