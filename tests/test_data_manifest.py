@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from study.data.manifest import (
+    YAML_LOADER,
     DataFile,
     LocalSource,
     Manifest,
@@ -33,7 +34,7 @@ def broken(tmp_path: Path) -> Callable[[Callable[[dict[str, Any]], object]], str
     """The message for the repository's manifest after one change."""
 
     def message(change: Callable[[dict[str, Any]], object]) -> str:
-        raw = copy.deepcopy(yaml.safe_load(default_manifest_path().read_text(encoding="utf-8")))
+        raw = copy.deepcopy(yaml.load(default_manifest_path().read_text(encoding="utf-8"), Loader=YAML_LOADER))
         change(raw)
         path = tmp_path / "data_manifest.yaml"
         path.write_text(_without_aliases(raw), encoding="utf-8")

@@ -21,7 +21,7 @@ from platformdirs import user_cache_path
 from tqdm import tqdm
 
 from study.data.archive import blocks, digest, open_member, write_checked
-from study.data.manifest import DataFile, LocalSource, Manifest, PypiSource, ZipSource
+from study.data.manifest import YAML_LOADER, DataFile, LocalSource, Manifest, PypiSource, ZipSource
 from study.data.pypi import file_url
 from study.data.web import RangesRefused, Web, shown
 from study.data.zip_ranges import RemoteArchive, open_remote
@@ -29,8 +29,7 @@ from study.errors import StudyError
 
 LOCK_NAME = "data_lock.yaml"
 DISK_MARGIN_BYTES = 200 << 20  # what a machine needs to stay usable beside the data
-YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the lock file is rewritten once per file of a cohort
-YAML_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+YAML_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the lock file is rewritten once per file of a cohort
 COLUMNS = ("dataset", "subject", "role", "file", "status", "bytes", "source", "licence", "title", "path")
 
 

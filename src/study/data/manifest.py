@@ -16,6 +16,7 @@ from study.data.archive import is_safe_member
 from study.errors import StudyError
 
 MANIFEST_NAME = "data_manifest.yaml"
+YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same YAML, read ten times faster where libyaml is
 STRUCTURE = "{structure}"
 AXIS_CODES = ("RL", "AP", "SI")
 
@@ -348,15 +349,15 @@ def load_manifest(path: Path | str | None = None) -> Manifest:
     own = default_manifest_path() if path is None else Path(path).expanduser().resolve()
     text = _read(own)
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        raw = yaml.safe_load(text)
+        root = yaml.compose(text, Loader=YAML_LOADER)
+        raw = yaml.load(text, Loader=YAML_LOADER)
     except yaml.YAMLError as error:
         raise StudyError(f"{own.name}: expected YAML, got {' '.join(str(error).split())}") from error
     faults = _repeated_keys(root)
     if not isinstance(raw, dict):
         raise StudyError(f"{own.name}: expected the keys files, cohorts and label_maps, got {type(raw).__name__}")
     if path is not None and isinstance(maps := raw.setdefault("label_maps", {}), dict):
-        raw["label_maps"] = yaml.safe_load(_read(default_manifest_path()))["label_maps"] | maps
+        raw["label_maps"] = yaml.load(_read(default_manifest_path()), Loader=YAML_LOADER)["label_maps"] | maps
     try:
         manifest = Manifest.model_validate(raw)
     except ValidationError as error:
