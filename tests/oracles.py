@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import asdict
+from pathlib import Path
 
-from study.types import CARTILAGES, Floats, Part, PointCloud
+import numpy as np
+import pandas as pd
+import pytest
+from threadpoolctl import threadpool_limits
+
+from study.types import CARTILAGES, Floats, Method, Part, PointCloud, Registration, RigidTransform
 
 
 def hausdorff_literal(a: Floats, b: Floats) -> float:
@@ -53,3 +59,68 @@ def bend(points: Floats, size: float = 1.0) -> Floats:
         y + size * (4 * np.cos(x / 60) - 2),
         z + size * (6 * np.sin(x / 50) + 0.04 * (z - 15)),
     ])
+
+
+def contract_pair(n_source: int = 1500, n_target: int = 1200) -> tuple[PointCloud, PointCloud, Floats]:
+    """A chest, the front of the same chest after a planted `bend`, and where each source point truly went."""
+    rng = np.random.default_rng(7)
+    source, target = toy_chest(rng, n_source), toy_chest(rng, n_target, anterior=True)
+    return source, PointCloud(bend(target.points), "toy-us", target.parts), bend(source.points)
+
+
+def check_contract(method: Method, *, identity_mm: float, pose_mm: float) -> None:
+    """What every method promises: row pairing, repeatability, identity, equivariance, inputs left alone.
+
+    Args:
+        method: the method.
+        identity_mm: mean distance that a cloud registered to itself may move.
+        pose_mm: how far the result may change when both clouds are moved together.
+    """
+    source, target, _ = contract_pair()
+    before = source.points.tobytes(), target.points.tobytes()
+
+    def run(a: PointCloud, b: PointCloud, seed: int = 0) -> Registration:
+        return method.register(a, b, np.random.default_rng(seed))
+
+    first = run(source, target)
+    assert not source.points.flags.writeable  # clouds are read-only: a write would have raised
+    assert (source.points.tobytes(), target.points.tobytes()) == before
+    assert first.source is source.points
+    assert first.warped.shape == source.points.shape
+    assert np.isfinite(first.warped).all()
+    assert first.method == method.name
+    assert first.n_iterations == len(first.history) > 0
+    assert first.stop_reason
+    assert first.seconds > 0
+
+    # The same seed gives the same bytes, whatever the number of threads around it.
+    for threads in (1, 2):
+        with threadpool_limits(limits=threads):
+            again = run(source, target)
+        assert again.warped.tobytes() == first.warped.tobytes()
+        assert again.history == first.history
+
+    still = run(source, source)
+    assert np.linalg.norm(still.warped - source.points, axis=1).mean() < identity_mm
+
+    motion = RigidTransform.random(np.random.default_rng(3))
+    moved = run(source.moved(motion), target.moved(motion))
+    assert np.linalg.norm(moved.warped - motion.apply(first.warped), axis=1).max() < pose_mm
+
+    # Rows keep their partners: shuffled rows give (nearly) the shuffled answer, never another point's.
+    order = np.random.default_rng(5).permutation(len(source))
+    shuffled = PointCloud(source.points[order], "shuffled", source.parts[order] if source.parts is not None else None)
+    assert np.linalg.norm(run(shuffled, target).warped - first.warped[order], axis=1).mean() < 0.5
+
+    # Labels are there for the methods that use them; these may not.
+    bare = run(PointCloud(source.points), PointCloud(target.points))
+    assert bare.warped.tobytes() == first.warped.tobytes()
+
+
+def check_tuned(method: Method) -> None:
+    """The tuned parameters are the best row of the recorded grid, no row of which failed on a case unseen."""
+    table = pd.read_csv(Path(__file__).parents[1] / "results" / "tuning" / f"{method.name}.csv")
+    best = table.sort_values(["failed", "waypoint_error_inplane_mm"], kind="stable").iloc[0]
+    assert len(table) > 10
+    for name, value in asdict(method).items():  # type: ignore[call-overload]
+        assert str(best[name]) == str(value) or float(best[name]) == pytest.approx(float(value)), name

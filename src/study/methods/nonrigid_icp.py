@@ -112,8 +112,8 @@ class NonrigidIcp:
         held = np.bincount(piece, weights=near)
         if held.min() < _MIN_HELD:
             raise StudyError(
-                f"nonrigid_icp: expected every piece of {name!r} to have target points within reach, got {held.min():.0f} "
-                f"vertices of one; check the coarse alignment or raise distance_threshold"
+                f"nonrigid_icp: expected every piece of {name!r} to have target points within reach, "
+                f"got {held.min():.0f} vertices of one; check the coarse alignment or raise distance_threshold"
             )
 
     def _bend(self, mesh: trimesh.Trimesh, target: Floats) -> list[Floats]:
