@@ -152,7 +152,7 @@ def run_dataset(
     manifest = manifest or load_manifest()
     todo = pairs(dataset, params, manifest)
     names = list(dict.fromkeys(name for pair in todo for name in pair))
-    calls = [(_timed, load_anatomy, dataset, name, params, seed, manifest) for name in names]
+    calls: list[tuple[Any, ...]] = [(_timed, load_anatomy, dataset, name, params, seed, manifest) for name in names]
     loaded = dict(zip(names, _in_parallel(calls, n_jobs, "anatomies", show_progress), strict=True))
     targets = list(dict.fromkeys(target for _, target in todo))
     calls = [(_timed, make_patient, _anatomy(loaded[name]), params, seed) for name in targets if _ok(loaded[name])]
@@ -162,7 +162,8 @@ def run_dataset(
     clouds: list[tuple[str, PointCloud]] = []
     clouds += [(name, _anatomy(loaded[name]).cloud) for name in {s for s, _ in todo} if _ok(loaded[name])]
     clouds += [(f"us:{name}", patients[name][0].cloud) for name in targets if _ok(patients[name])]
-    found = _in_parallel([(_timed, find_chest, cloud) for _, cloud in clouds], n_jobs, "coarse alignment", show_progress)
+    calls = [(_timed, find_chest, cloud) for _, cloud in clouds]
+    found = _in_parallel(calls, n_jobs, "coarse alignment", show_progress)
     chests = dict(zip((name for name, _ in clouds), found, strict=True))
 
     rows: list[Row] = []
@@ -257,12 +258,8 @@ def run_study(
     n_jobs: int = 1,
     manifest: Manifest | None = None,
     show_progress: bool = False,
-) -> pd.DataFrame:
-    """Run a dataset and write ``metrics.csv``, ``timings.csv``, ``provenance.json`` and the tables into ``out``.
-
-    Returns:
-        the Hausdorff table (sec. IV-A).
-    """
+) -> None:
+    """Run a dataset and write ``metrics.csv``, ``timings.csv``, ``provenance.json`` and the tables into ``out``."""
     manifest = manifest or load_manifest()
     started = datetime.now(UTC)
     rows, timings = run_dataset(
@@ -276,5 +273,25 @@ def run_study(
     if dataset in manifest.cohorts:
         inputs |= {key: file.sha256 for key, file in manifest.files_of(dataset).items() if file.sha256}
     write_json(provenance(parameters, seed, inputs, started, datetime.now(UTC)), out / "provenance.json")
-    frame = pd.DataFrame(rows)
-    return write_hd_table(frame, out / "hd_table")
+    write_tables(pd.DataFrame(rows), out)
+
+
+def write_tables(metrics: pd.DataFrame, out: Path) -> None:
+    """Hausdorff tables in the shape of the paper's Table I: one a patient, columns the CTs.
+
+    One CT with several patients (the planted deformations) is turned: columns are the patients.
+    """
+    targets = sorted(metrics["target"].unique())
+    dataset = metrics["dataset"].iloc[0]
+    if metrics["subject"].nunique() == 1:
+        turned = metrics.assign(subject=metrics["target"])
+        caption = f"Hausdorff distance, {dataset}: {metrics['subject'].iloc[0]} to each simulated patient"
+        write_hd_table(turned, out / "hd_table", caption=caption)
+        return
+    for target in targets:
+        stem = out / ("hd_table" if len(targets) == 1 else f"hd_table_{target}")
+        caption = f"Hausdorff distance, {dataset}: each CT to the simulated patient {target}"
+        write_hd_table(metrics[metrics["target"] == target], stem, caption=caption)
+    if len(targets) > 1:
+        pairs_named = metrics.assign(subject=metrics["subject"] + " to " + metrics["target"])
+        write_hd_table(pairs_named, out / "hd_all_pairs", caption=f"Hausdorff distance, {dataset}: all ordered pairs")

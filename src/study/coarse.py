@@ -70,7 +70,9 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
             f"{cloud.name}: expected cartilages that arch {MIN_BULGE_MM} mm or more to the front, got "
             f"{abs(bulge):.2f} mm, so front and back look alike; give the cloud its `front` direction"
         )
-    bend_low, bend_high = (np.mean([_bend_mm(local[numbers == k]) for k in ends]) for ends in ((1, 5), (4, 8)))
+    bend_low, bend_high = (
+        float(np.mean([_bend_mm(local[numbers == k]) for k in ends])) for ends in ((1, 5), (4, 8))
+    )
     # Half a turn about y looks from the other face, half a turn about z turns the foot down: never a reflection.
     if bulge < 0:
         T_cloud_sternum = T_cloud_sternum @ RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
@@ -204,7 +206,8 @@ def chest_frame(cloud: PointCloud) -> ChestFrame:
     x, y = (sternum - origin) @ left, (sternum - origin) @ up
     (x0, x1), (y0, y1) = np.percentile(x, [2, 98]), np.percentile(y, [1, 99])
     origin = origin + (x0 + x1) / 2 * left + (y0 + y1) / 2 * up
+    half_width = (x1 - x0) / 2
     reach = {
-        part: float(np.percentile(np.abs((cloud.only(part) - origin) @ left), 98) - (x1 - x0) / 2) for part in CARTILAGES
+        part: float(np.percentile(np.abs((cloud.only(part) - origin) @ left), 98) - half_width) for part in CARTILAGES
     }
     return ChestFrame(origin, left, up, np.cross(left, up), float(y1 - y0), float(x1 - x0), reach)

@@ -10,7 +10,7 @@ import numpy as np
 
 from study import phantom
 from study.cartilage_growth import parts_from_landmarks, parts_from_ribs
-from study.ct import check_field_of_view, parts_from_labels, sample_cloud, surface
+from study.ct import parts_from_labels, sample_cloud, surface
 from study.data.fetch import fetch
 from study.data.landmarks import read_landmarks
 from study.data.manifest import Manifest, Subject, load_manifest
@@ -96,7 +96,7 @@ def pairs(dataset: str, params: StudyParams, manifest: Manifest | None = None) -
         others = [source for source in sources if source != target]
         chosen += [(source, target) for source in others[: params.max_sources or None]]
     if not chosen:
-        raise StudyError(f"dataset {dataset!r}: expected at least two subjects, one of them a patient; got none to pair")
+        raise StudyError(f"dataset {dataset!r}: expected two subjects or more, one of them a patient; got none to pair")
     return chosen
 
 
@@ -124,10 +124,15 @@ def load_anatomy(
         mask = parts_from_labels(labels, ids)
     else:
         image, mask = _read(manifest, cohort.subjects[name])
+    anatomy = anatomy_of(name, image, mask, params.ct_points, rng)
+    return replace(anatomy, waypoints=phantom.waypoints(drawn)) if cohort.kind == "generated" else anatomy
+
+
+def anatomy_of(name: str, image: Volume, mask: Volume, n_points: int, rng: np.random.Generator) -> Anatomy:
+    """Surface, cloud and protocol waypoints of a CT whose parts are known (sec. II-C.1, IV-B)."""
     mesh = replace(surface(mask), name=name)
-    cloud = replace(sample_cloud(mesh, params.ct_points, rng), name=f"ct:{name}")
-    exact = phantom.waypoints(drawn) if cohort.kind == "generated" else intercostal_waypoints(cloud)
-    return Anatomy(name, mesh, cloud, exact, image, mask)
+    cloud = replace(sample_cloud(mesh, n_points, rng), name=f"ct:{name}")
+    return Anatomy(name, mesh, cloud, intercostal_waypoints(cloud), image, mask)
 
 
 def _read(manifest: Manifest, subject: Subject) -> tuple[Volume, Volume]:
@@ -153,7 +158,6 @@ def _read(manifest: Manifest, subject: Subject) -> tuple[Volume, Volume]:
             f"{manifest.path.name}: expected labels, rib_labels or landmarks for {subject.title or subject.ct!r}, "
             "got none; without them cartilage cannot be told from muscle"
         )
-    check_field_of_view(mask, image)
     return image, mask
 
 

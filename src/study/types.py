@@ -80,7 +80,7 @@ def as_points(points: ArrayLike, name: str = "points", *, at_least: int = 1) -> 
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise StudyError(
-            f"{name}: expected finite numbers, got {bad.size} rows with NaN or infinity (first: row {bad[0]}); drop them"
+            f"{name}: expected finite numbers, got {bad.size} rows with NaN or infinity, the first {bad[0]}; drop them"
         )
     array.flags.writeable = False
     return array
@@ -111,7 +111,8 @@ class PointCloud:
         if not MIN_EXTENT_MM <= extent <= MAX_EXTENT_MM:
             hint = "; metres? multiply by 1000" if 0.02 <= extent < 2.0 else "; check the units"
             raise StudyError(
-                f"{self.name}: expected a chest of {MIN_EXTENT_MM:g}-{MAX_EXTENT_MM:g} mm across, got {extent:.3g} mm{hint}"
+                f"{self.name}: expected a chest of {MIN_EXTENT_MM:g}-{MAX_EXTENT_MM:g} mm across, "
+                f"got {extent:.3g} mm{hint}"
             )
         object.__setattr__(self, "points", points)
         if self.parts is not None:
@@ -183,7 +184,9 @@ class RigidTransform:
         rotation = np.array(self.rotation, dtype=np.float64)
         translation = np.array(self.translation, dtype=np.float64)
         if rotation.shape != (3, 3) or translation.shape != (3,):
-            raise StudyError(f"expected a (3, 3) rotation and (3,) translation, got {rotation.shape}, {translation.shape}")
+            raise StudyError(
+                f"expected a (3, 3) rotation and (3,) translation, got {rotation.shape}, {translation.shape}"
+            )
         proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
         if not (proper and np.isfinite(translation).all()):
             raise StudyError("expected a proper rotation (det +1) and a finite translation, got something else")
@@ -278,7 +281,7 @@ class Volume:
         values = np.asarray(self.values).view()
         spacing = np.array(self.spacing_mm, dtype=np.float64)
         if values.ndim != 3 or min(values.shape) < 2:
-            raise StudyError(f"{self.name}: expected a 3-D image, got an array of shape {values.shape}; give a whole series")
+            raise StudyError(f"{self.name}: expected a 3-D image, got an array of shape {values.shape}; give a series")
         if spacing.shape != (3,) or not np.isfinite(spacing).all() or (spacing <= 0).any():
             raise StudyError(f"{self.name}: expected three positive spacings in mm, got {spacing}; check the header")
         values.flags.writeable = False
@@ -557,6 +560,7 @@ class Method(Protocol):
     """A registration method: a frozen dataclass of its parameters plus one verb."""
 
     name: ClassVar[str]
+    __dataclass_fields__: ClassVar[dict[str, Any]]  # a frozen dataclass: asdict(method) is its provenance
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Register labelled, coarsely aligned clouds: ``warped`` row i is source point i in the target frame."""
