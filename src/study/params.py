@@ -68,3 +68,31 @@ def override(params: StudyParams, **changes: Any) -> StudyParams:
     if unknown:
         raise StudyError(f"expected parameters among {', '.join(sorted(known))}, got {', '.join(unknown)}")
     return replace(params, **changes)
+
+
+def check_parameters(namespace: Mapping[str, Any], **allowed: type) -> None:
+    """Refuse what a notebook does not know; papermill itself would inject it and go on.
+
+    Call it in the cell after the parameters with ``globals()``.
+
+    Args:
+        namespace: names and values so far.
+        allowed: type of each parameter, by name.
+
+    Raises:
+        StudyError: a plain value under an unknown name, a missing parameter or one of another type.
+    """
+    kernel = {"In", "Out"}
+    plain = (str, bytes, bool, int, float, list, tuple, dict, set, type(None))
+    given = {
+        name: value
+        for name, value in namespace.items()
+        if not name.startswith("_") and name not in kernel and isinstance(value, plain)
+    }
+    unknown = sorted(set(given) - set(allowed))
+    if unknown:
+        raise StudyError(f"expected parameters among {', '.join(allowed)}, got unknown {', '.join(unknown)}")
+    for name, kind in allowed.items():
+        value = given.get(name)
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise StudyError(f"parameter {name}: expected {kind.__name__}, got {value!r} ({type(value).__name__})")
