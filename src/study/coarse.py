@@ -15,6 +15,23 @@ MIN_BULGE_MM = 0.2
 
 
 @dataclass(frozen=True)
+class ChestSearch:
+    """What the search saw on its way, for looking at (the paper's Fig. 2).
+
+    Attributes:
+        plane: (n, 2) mm, the cloud in its feature plane.
+        fit: the rectangle there, with those of the coarser scales.
+        local: (n, 2) mm, the cloud in sternum coordinates, y along the symmetry axis.
+        branches: sternum edges, seeds and branches in ``local``.
+    """
+
+    plane: Floats
+    fit: SternumFit
+    local: Floats
+    branches: Branches
+
+
+@dataclass(frozen=True)
 class Chest:
     """A cloud whose sternum, branches, sides and levels are known.
 
@@ -24,6 +41,7 @@ class Chest:
         sternum_overlap: F_k over the area of the rectangle (Eq. 1).
         bend_ratio: bend of the branches taken as 5th over that of the branches taken as 2nd.
         bulge_mm: mean arch of the branches towards the front.
+        search: how they were found.
     """
 
     cloud: PointCloud
@@ -31,6 +49,7 @@ class Chest:
     sternum_overlap: float
     bend_ratio: float
     bulge_mm: float
+    search: ChestSearch
 
 
 @dataclass(frozen=True)
@@ -58,7 +77,8 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
     p = params or SternumParams()
     T_cloud_plane = feature_plane(cloud)
     flat = T_cloud_plane.inverse.apply(cloud.points)[:, :2]
-    fit, T_plane_sternum, branches = _sternum_with_branches(flat, p, cloud.name)
+    search, T_plane_sternum = _sternum_with_branches(flat, p, cloud.name)
+    branches = search.branches
     T_cloud_sternum = T_cloud_plane @ T_plane_sternum
     local = T_cloud_sternum.inverse.apply(cloud.points)
     numbers = branches.branch
@@ -86,13 +106,13 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
     front = sternum_front_mm(T_cloud_sternum.inverse.apply(cloud.points), p)
     T_cloud_chest = T_cloud_sternum @ RigidTransform(np.eye(3), np.array([0.0, 0.0, front]))
     ratio = max(bend_low, bend_high) / max(min(bend_low, bend_high), 1e-9)
-    return Chest(replace(cloud, parts=parts), T_cloud_chest, fit.overlap, float(ratio), abs(bulge))
+    return Chest(replace(cloud, parts=parts), T_cloud_chest, search.fit.overlap, float(ratio), abs(bulge), search)
 
 
 def _sternum_with_branches(
     flat: Floats, params: SternumParams, name: str
-) -> tuple[SternumFit, RigidTransform, Branches]:
-    """The best covered rectangle that four separate branches leave on each side."""
+) -> tuple[ChestSearch, RigidTransform]:
+    """The best covered rectangle that four separate branches leave on each side, and T_plane_sternum."""
     first_error: StudyError | None = None
     best = 0.0
     lifted = np.column_stack([flat, np.zeros(len(flat))])
@@ -113,7 +133,7 @@ def _sternum_with_branches(
             continue
         # The rectangle slides along a longer or shorter sternum; the eight attachments do not.
         along = np.array([0.0, branches.seeds[:, 1].mean()])
-        return fit, T_plane_sternum @ _turn(0.0, along), branches
+        return ChestSearch(flat, fit, local, branches), T_plane_sternum @ _turn(0.0, along)
     if first_error is not None:
         raise first_error
     raise StudyError(

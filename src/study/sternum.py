@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -42,11 +42,20 @@ class SternumFit:
         centre: (2,) mm in plane coordinates.
         angle_deg: rotation of the long edge from the plane's second axis, counter-clockwise.
         overlap: covered part of the rectangle, 0-1 (F_k over its area).
+        scale_mm: edge of a pixel of the search that found it.
+        coarser: the fit at the scale before, whose neighbourhood was searched.
     """
 
     centre: Floats
     angle_deg: float
     overlap: float
+    scale_mm: float = 0.0
+    coarser: SternumFit | None = None
+
+    @property
+    def searches(self) -> tuple[SternumFit, ...]:
+        """The fit of every scale, coarse to fine."""
+        return (*(self.coarser.searches if self.coarser else ()), self)
 
 
 def feature_plane(cloud: PointCloud) -> RigidTransform:
@@ -98,7 +107,8 @@ def _best_place(
             away = np.hypot(*(np.indices(covered.shape) * scale_mm + origin[:, None, None] - near[:, None, None]))
             covered[away > 2.5 * params.scales_mm[0]] = 0.0
         ties = np.argwhere(covered >= covered.max() - 1e-6)
-        fits.append(SternumFit(ties.mean(axis=0) * scale_mm + origin, float(angle), float(covered.max())))
+        centre = ties.mean(axis=0) * scale_mm + origin
+        fits.append(SternumFit(centre, float(angle), float(covered.max()), scale_mm))
     return sorted(fits, key=lambda fit: -fit.overlap)
 
 
@@ -121,7 +131,7 @@ def sternum_candidates(points: Floats, params: SternumParams | None = None) -> I
             continue
         for scale, half_range, step in zip(p.scales_mm[1:], p.ranges_deg, p.steps_deg[1:], strict=True):
             angles = np.arange(fit.angle_deg - half_range, fit.angle_deg + half_range + step / 2, step)
-            fit = _best_place(points, scale, angles, fit.centre, p, close_mm)[0]
+            fit = replace(_best_place(points, scale, angles, fit.centre, p, close_mm)[0], coarser=fit)
         if not any(_alike(fit, other, p) for other in tried):
             yield fit
         tried.append(fit)
