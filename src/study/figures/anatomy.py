@@ -1,0 +1,196 @@
+"""Pictures of CTs, surfaces and clouds (sec. II-C.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike
+
+from study.errors import StudyError
+from study.figures.style import (
+    PART_COLOUR,
+    bounds,
+    dots,
+    draw_surface,
+    look,
+    mark_sides,
+    name_parts,
+    new_figure,
+    part_colours,
+    part_legend,
+    project,
+    require,
+)
+from study.types import (
+    Floats,
+    Ints,
+    Mesh,
+    Part,
+    PointCloud,
+    RigidTransform,
+    Volume,
+)
+
+_DRAWN: Mapping[Part, Any] = {part: colour for part, colour in PART_COLOUR.items() if part != Part.UNKNOWN}
+
+
+def _grid_mm(volume: Volume, axis: int) -> Floats:
+    """Voxel centres along one axis of the grid, mm; RAS+ where the grid is not tilted."""
+    return volume.T_ras_index.translation[axis] + np.arange(volume.shape[axis]) * volume.spacing_mm[axis]
+
+
+def _place(volume: Volume, mask: Volume) -> Ints:
+    """The voxel of ``volume`` that is ``mask``'s first."""
+    start = volume.to_index(mask.to_mm([[0, 0, 0]]))[0]
+    first = np.round(start).astype(np.int64)
+    same = np.allclose(volume.spacing_mm, mask.spacing_mm) and np.allclose(start, first, atol=0.05)
+    if not same or (first < 0).any() or (first + mask.shape > volume.shape).any():
+        raise StudyError(f"expected a mask on the grid of {volume.name}, got another grid; crop or resample, not both")
+    require(np.flatnonzero(mask.values >= 0), f"labelled voxels of {mask.name}")
+    return first
+
+
+def _part_contours(ax: Axes, xy: Sequence[Floats], parts: Ints, colours: Mapping[Part, Any], **style: Any) -> None:
+    for part, colour in colours.items():
+        inside = parts == part
+        if inside.any():
+            padded = np.pad(inside, 1).T.astype(float)
+            wide = [np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in xy]
+            drawn = ax.contour(*wide, padded, levels=[0.5], colors=[colour], **style)
+            drawn.set_path_effects([withStroke(linewidth=style["linewidths"] + 1.4, foreground="black")])
+
+
+def _grey_image(ax: Axes, values: ArrayLike, x: Floats, y: Floats, window: tuple[float, float]) -> None:
+    """``values[i, j]`` at x[i], y[j]; both rise or both axes are turned so that they do."""
+    dx, dy = abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2
+    extent = (x.min() - dx, x.max() + dx, y.min() - dy, y.max() + dy)
+    image = np.asarray(values)[np.argsort(x)][:, np.argsort(y)].T
+    ax.imshow(image, cmap="gray", vmin=window[0], vmax=window[1], extent=extent, origin="lower", rasterized=True)
+
+
+def _best_slice(mask: Volume, axis: int) -> int:
+    """The slice that shows most parts, and of those the one that shows most of them."""
+    planes = np.moveaxis(mask.values, axis, 0).reshape(mask.shape[axis], -1)
+    n_parts = np.sum([(planes == part).any(axis=1) for part in _DRAWN], axis=0)
+    return int(np.lexsort(((planes >= 0).sum(axis=1), n_parts))[-1])
+
+
+def ct_slice(
+    volume: Volume,
+    mask: Volume,
+    *,
+    reference: Volume | None = None,
+    at_mm: ArrayLike | None = None,
+    window_hu: tuple[float, float] = (-160.0, 350.0),
+    margin_mm: float = 25.0,
+) -> Figure:
+    """An axial and a coronal slice with the contour of each part.
+
+    Args:
+        volume: Hounsfield units, axes along R, A, S.
+        mask: `Part` values on the same grid or a crop of it.
+        reference: other parts on the grid of ``mask``, dashed.
+        at_mm: (3,) RAS+ place the slices go through; without it, where most parts are seen.
+        window_hu: darkest and brightest value.
+        margin_mm: shown around the mask.
+
+    Raises:
+        StudyError: an empty mask, or one on another grid.
+    """
+    first = _place(volume, mask)
+    labelled = mask.values >= 0
+    if at_mm is None:
+        cut = [_best_slice(mask, axis) for axis in range(3)]
+    else:
+        cut = np.round(mask.to_index(np.reshape(at_mm, (1, 3)))[0]).astype(int).tolist()
+        if not all(0 <= index < n for index, n in zip(cut, mask.shape, strict=True)):
+            raise StudyError(f"expected a place inside {mask.name}, got {at_mm} mm; take a point of the mask")
+    boxes = [np.flatnonzero(labelled.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
+    figure = new_figure(4.6, f"{volume.name}: parts on the CT, window {window_hu[0]:g} to {window_hu[1]:g} HU")
+    for ax, (axis, up, title) in zip(figure.subplots(1, 2), ((2, 1, "axial"), (1, 2, "coronal")), strict=True):
+        x, y = -_grid_mm(volume, 0), _grid_mm(volume, up)
+        shown = np.take(volume.values, first[axis] + cut[axis], axis)
+        _grey_image(ax, shown, x, y, window_hu)
+        mine = [grid[first[a] : first[a] + mask.shape[a]] for a, grid in ((0, x), (up, y))]
+        _part_contours(ax, mine, np.take(mask.values, cut[axis], axis), _DRAWN, linewidths=1.4)
+        if reference is not None:
+            white: Mapping[Part, Any] = dict.fromkeys(_DRAWN, "white")
+            other = np.take(mask.with_values(reference.values).values, cut[axis], axis)
+            _part_contours(ax, mine, other, white, linewidths=0.9, linestyles="dashed")
+        (xa, xb), (ya, yb) = (
+            (grid[box[0]], grid[box[-1]]) for grid, box in zip(mine, (boxes[0], boxes[up]), strict=True)
+        )
+        extent = np.array([[min(xa, xb) - margin_mm, ya - margin_mm], [max(xa, xb) + margin_mm, yb + margin_mm]])
+        place = _grid_mm(volume, axis)[first[axis] + cut[axis]]
+        look(ax, "front", extent, f"{title}, {'S' if axis == 2 else 'A'} = {place:.1f} mm")
+        ax.set_ylabel("to the front (mm)" if up == 1 else "up (mm)", fontsize=8)
+        mark_sides(ax, "white")
+    part_legend(figure)
+    return figure
+
+
+def anatomy_overview(
+    subjects: Mapping[str, tuple[Volume, Volume]], *, window_hu: tuple[float, float] = (-50.0, 600.0)
+) -> Figure:
+    """Each subject's cartilages over a coronal maximum projection of its CT.
+
+    The projection runs over the slab in which the mask lies: the spine and the heart would cover it.
+
+    Args:
+        subjects: by name, Hounsfield units and `Part` values on the same grid or a crop of it.
+        window_hu: darkest and brightest value.
+
+    Raises:
+        StudyError: no subject, an empty mask, or one on another grid.
+    """
+    require(subjects, "subjects")
+    columns = min(3, len(subjects))
+    rows = -(-len(subjects) // columns)
+    figure = new_figure(0.7 + rows * 9.6 / columns, "Sternum and cartilages over the front of each CT")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, (name, (volume, mask)) in zip(grid, subjects.items(), strict=False):
+        first = _place(volume, mask)
+        depth = np.flatnonzero((mask.values >= 0).any(axis=(0, 2))) + first[1]
+        projection = volume.values[:, depth[0] : depth[-1] + 1].max(axis=1)
+        x, y = -_grid_mm(volume, 0), _grid_mm(volume, 2)
+        _grey_image(ax, projection, x, y, window_hu)
+        mine = [grid_mm[first[a] : first[a] + mask.shape[a]] for a, grid_mm in ((0, x), (2, y))]
+        for part, colour in _DRAWN.items():
+            silhouette = np.where((mask.values == part).any(axis=1), int(part), int(Part.UNKNOWN))
+            _part_contours(ax, mine, silhouette, {part: colour}, linewidths=1.6)
+        flat = (mask.values >= 0).any(axis=1)
+        seen = np.column_stack([mine[0][np.nonzero(flat)[0]], mine[1][np.nonzero(flat)[1]]])
+        spacing = " × ".join(f"{s:.2g}" for s in volume.spacing_mm)
+        look(ax, "front", bounds(seen, margin_mm=30.0), f"{name} ({spacing} mm)")
+        mark_sides(ax, "white")
+    for ax in grid[len(subjects) :]:
+        ax.set_axis_off()
+    part_legend(figure)
+    return figure
+
+
+def mesh_and_cloud(mesh: Mesh, cloud: PointCloud, *, T_cloud_chest: RigidTransform | None = None) -> Figure:
+    """A surface and the cloud sampled from it, from the front, coloured by part (sec. II-C.1).
+
+    Args:
+        mesh, cloud: in one frame.
+        T_cloud_chest: chest coordinates to that frame; None for RAS+.
+    """
+    vertices, points = (project(p, "front", T_cloud_chest) for p in (mesh.vertices, cloud.points))
+    extent = bounds(vertices, points)
+    figure = new_figure(4.6, f"{mesh.name}: surface and the cloud sampled from it")
+    left, right = figure.subplots(1, 2)
+    draw_surface(left, vertices, mesh.faces, part_colours(mesh.parts, len(vertices)))
+    dots(right, points, part_colours(cloud.parts, len(points)), size=4)
+    titles = (f"surface, {len(mesh.faces):,} triangles", f"cloud, {len(cloud):,} points")
+    for ax, title in zip((left, right), titles, strict=True):
+        look(ax, "front", extent, title)
+    if cloud.parts is not None:
+        name_parts(right, points, cloud.parts)
+    part_legend(figure)
+    return figure
