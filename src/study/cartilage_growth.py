@@ -29,6 +29,7 @@ from study.types import CARTILAGES, Bools, Floats, Part, RigidTransform, Volume
 GRID_MM = 1.0  # all of this is done on an isotropic grid, so that voxels are millimetres
 MARGIN_MM = 25.0  # around the landmarks
 AIR_HU = -200.0  # a chest CT in Hounsfield units has lung and room air far below this
+JOINT_MM = 4.0  # a line's last cross-section runs on this far, to meet the sternum all around
 N_RAYS = 36
 RAY_MM = np.arange(0.5, 12.01, 0.5)
 
@@ -249,7 +250,7 @@ def _tube(soft: Floats, line: Floats, front: Floats, growth: Growth) -> Bools:
     depth, width, beyond = (np.einsum("ij,ij->i", offset, axis[at]) for axis in (outwards, across, along))
     turn = np.arctan2(width, depth) % (2 * np.pi) * N_RAYS / (2 * np.pi)
     wall = ndimage.map_coordinates(np.concatenate([radius, radius[:, :1]], axis=1), [at, turn], order=1)
-    past_end = ((at == 0) & (beyond < -0.5)) | ((at == len(line) - 1) & (beyond > 0.5))
+    past_end = ((at == 0) & (beyond < -0.5)) | ((at == len(line) - 1) & (beyond > JOINT_MM))
     inside = np.zeros(soft.shape, dtype=bool)
     inside[tuple(voxels[(np.hypot(depth, width) < wall) & ~past_end].T)] = True
     return inside
