@@ -12,6 +12,7 @@ from study.sternum import SternumFit, SternumParams, feature_plane, sternum_cand
 from study.types import CARTILAGES, ChestFrame, Floats, Part, PointCloud, RigidTransform
 
 MIN_BULGE_MM = 0.2
+MAX_OFFSET_MM = 15.0  # between the two roots of a level: people differ by up to 8, a missing branch shifts by a level
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ def _sternum_with_branches(
         local = T_plane_sternum.inverse.apply(lifted)[:, :2]
         try:
             branches = find_branches(local, params.height_mm, name)
+            _check_pairs(branches, name)
         except StudyError as error:
             first_error = first_error or error
             continue
@@ -140,6 +142,16 @@ def _sternum_with_branches(
         f"no sternum found in {name!r}: best overlap {best:.2f} of a {params.width_mm:g} × {params.height_mm:g} mm "
         f"rectangle, need {params.min_overlap:.2f}; check that the cloud holds sternum and cartilages 2-5"
     )
+
+
+def _check_pairs(branches: Branches, name: str) -> None:
+    """Refuse four branches a side that face gaps: a rectangle laid askew can find eight where one is missing."""
+    offset = float(np.abs(branches.seeds[:4, 1] - branches.seeds[4:, 1]).max())
+    if offset > MAX_OFFSET_MM:
+        raise StudyError(
+            f"{name}: expected cartilages that leave the sternum in pairs up to {MAX_OFFSET_MM:g} mm apart along it, "
+            f"got {offset:.0f} mm; is a branch missing, or does the cloud hold more than cartilages 2-5?"
+        )
 
 
 def _turn(angle: float, shift: Floats) -> RigidTransform:
@@ -223,11 +235,15 @@ def chest_frame(cloud: PointCloud) -> ChestFrame:
     up = up * np.sign(up @ (heads - feet))
     left = left - (left @ up) * up
     left /= np.linalg.norm(left)
-    x, y = (sternum - origin) @ left, (sternum - origin) @ up
-    (x0, x1), (y0, y1) = np.percentile(x, [2, 98]), np.percentile(y, [1, 99])
-    origin = origin + (x0 + x1) / 2 * left + (y0 + y1) / 2 * up
+    x = (sternum - origin) @ left
+    x0, x1 = np.percentile(x, [2, 98])
+    origin = origin + (x0 + x1) / 2 * left
     half_width = (x1 - x0) / 2
-    reach = {
-        part: float(np.percentile(np.abs((cloud.only(part) - origin) @ left), 98) - half_width) for part in CARTILAGES
-    }
-    return ChestFrame(origin, left, up, np.cross(left, up), float(y1 - y0), float(x1 - x0), reach)
+    root, reach = {}, {}
+    for part in CARTILAGES:
+        away = cloud.only(part) - origin
+        lateral = np.abs(away @ left)
+        medial = lateral <= np.percentile(lateral, 15)
+        root[part] = float((away @ up)[medial].mean())
+        reach[part] = float(np.percentile(lateral, 98) - half_width)
+    return ChestFrame(origin, left, up, np.cross(left, up), float(x1 - x0), root, reach)
