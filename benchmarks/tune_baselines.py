@@ -26,7 +26,7 @@ from study.errors import StudyError
 from study.geometry import principal_axes
 from study.methods.cpd import Cpd
 from study.methods.icp import Icp
-from study.methods.nonrigid_icp import NonrigidIcp
+from study.methods.nonrigid_icp import NonrigidIcp, Step
 from study.metrics import hausdorff_mm, point_errors_mm
 from study.types import Floats, Method, PointCloud
 
@@ -68,9 +68,14 @@ def development_case(name: str, seed: int) -> Case:
     )
 
 
-def amberg_steps(stiffest: float) -> tuple[tuple[float, float, float, int], ...]:
-    """Amberg's order, stiff first (trimesh's own steps rise and fall by a factor of three)."""
-    return tuple((stiffest / 3**k, 0.0, 0.5 if k < 3 else 0.0, 10) for k in range(4))
+def scaled_steps(factor: float) -> tuple[Step, ...]:
+    """The library's own steps, stiffer by ``factor``."""
+    return tuple((round(ws * factor, 6), wl, wn, n) for ws, wl, wn, n in NonrigidIcp().steps)
+
+
+def falling_steps(stiffest: float) -> tuple[Step, ...]:
+    """Amberg's order, stiff first."""
+    return tuple((round(stiffest / 3**k, 6), 0.0, 0.5 if k < 3 else 0.0, 10) for k in range(4))
 
 
 def grid(name: str) -> Iterator[Method]:
@@ -81,11 +86,14 @@ def grid(name: str) -> Iterator[Method]:
             yield Icp(max_distance_mm=distance, point_to_plane=plane, max_iterations=200)
     elif name == "nonrigid_icp":
         yield NonrigidIcp()
-        for stiffest, threshold in product((0.01, 0.03, 0.1, 0.3), (0.05, 0.1, 0.2)):
-            yield NonrigidIcp(steps=amberg_steps(stiffest), distance_threshold=threshold)
+        schedules = (scaled_steps(0.3), scaled_steps(1.0), scaled_steps(3.0), falling_steps(0.03))
+        for steps, gamma in product(schedules, (0.1, 1.0, 10.0)):
+            if NonrigidIcp(steps=steps, gamma=gamma) != NonrigidIcp():
+                yield NonrigidIcp(steps=steps, gamma=gamma)
+        yield NonrigidIcp(distance_threshold=0.05)
     elif name == "cpd":
         yield Cpd()
-        for beta, alpha, share in product((20.0, 30.0, 50.0, 80.0), (0.2, 2.0, 20.0), (0.0, 0.1)):
+        for beta, alpha, share in product((30.0, 50.0, 80.0, 120.0), (0.2, 2.0), (0.0, 0.1)):
             yield Cpd(beta_mm=beta, alpha=alpha, outlier_share=share)
     else:
         raise SystemExit(f"expected icp, nonrigid_icp or cpd, got {name!r}")

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from oracles import check_contract, contract_pair, toy_chest
+from oracles import check_contract, check_tuned, contract_pair, toy_chest
 from pycpd import DeformableRegistration
 from threadpoolctl import threadpool_limits
 
@@ -83,3 +83,7 @@ def test_running_out_of_iterations_is_reported():
 def test_bad_parameters_are_refused(bad):
     with pytest.raises(StudyError, match="cpd: expected"):
         Cpd(**bad)
+
+
+def test_the_tuned_setting_is_the_best_of_the_recorded_grid():
+    check_tuned(Cpd.tuned())

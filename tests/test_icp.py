@@ -1,7 +1,7 @@
 import numpy as np
 import open3d as o3d
 import pytest
-from oracles import check_contract, contract_pair, toy_chest
+from oracles import check_contract, check_tuned, contract_pair, toy_chest
 from scipy.spatial.transform import Rotation
 
 from study.errors import StudyError
@@ -71,3 +71,7 @@ def test_clouds_out_of_reach_and_bad_parameters_are_refused():
     for bad in ({"max_distance_mm": 0.0}, {"max_iterations": 0}):
         with pytest.raises(StudyError, match="icp: expected"):
             Icp(**bad)
+
+
+def test_the_tuned_setting_is_the_best_of_the_recorded_grid():
+    check_tuned(Icp.tuned())

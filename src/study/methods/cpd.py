@@ -56,6 +56,11 @@ class Cpd:
                 f"got {self.max_iterations} and {self.max_points}"
             )
 
+    @classmethod
+    def tuned(cls) -> Cpd:
+        """The best row of ``results/tuning/cpd.csv``, found on development subjects by benchmarks/tune_baselines.py."""
+        return cls(alpha=0.2, beta_mm=50.0)
+
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Drift ``source`` onto ``target``; nothing is drawn from ``rng``.
 

@@ -43,6 +43,11 @@ class Icp:
                 f"got {self.max_distance_mm} and {self.max_iterations}"
             )
 
+    @classmethod
+    def tuned(cls) -> Icp:
+        """The best row of ``results/tuning/icp.csv``, found on development subjects by benchmarks/tune_baselines.py."""
+        return cls(max_distance_mm=7.0, max_iterations=200)
+
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Fit ``source`` to ``target`` rigidly; nothing is drawn from ``rng``.
 
