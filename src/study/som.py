@@ -68,20 +68,24 @@ def neighbourhood(hops: Ints, radius: float) -> Floats:
 
 @njit(cache=True)
 def _epoch(nodes, points, theta, rate):  # type: ignore[no-untyped-def]
-    m = nodes.shape[0]
+    # nodes is (3, m): one coordinate after the other lets the compiler take several nodes at a time.
+    m = nodes.shape[1]
+    x, y, z = nodes[0], nodes[1], nodes[2]
+    apart = np.empty(m)
     for k in range(points.shape[0]):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
-        winner, best = 0, np.inf
         for s in range(m):
-            dx, dy, dz = px - nodes[s, 0], py - nodes[s, 1], pz - nodes[s, 2]
-            d = dx * dx + dy * dy + dz * dz
-            if d < best:
-                winner, best = s, d
-        for s in range(m):
-            step = theta[winner, s] * rate  # Eq. 2
-            nodes[s, 0] += step * (px - nodes[s, 0])
-            nodes[s, 1] += step * (py - nodes[s, 1])
-            nodes[s, 2] += step * (pz - nodes[s, 2])
+            apart[s] = (px - x[s]) ** 2 + (py - y[s]) ** 2 + (pz - z[s]) ** 2
+        winner = 0
+        for s in range(1, m):
+            if apart[s] < apart[winner]:
+                winner = s
+        pull = theta[winner]
+        for s in range(m):  # Eq. 2
+            step = pull[s] * rate
+            x[s] += step * (px - x[s])
+            y[s] += step * (py - y[s])
+            z[s] += step * (pz - z[s])
 
 
 def fit_som(
@@ -99,9 +103,9 @@ def fit_som(
 
     Returns:
         the fitted graph, and the quantisation error (mean distance from points to their nearest node, mm)
-        at twenty even steps.
+        at ten even steps.
     """
-    nodes = np.array(graph.nodes)
+    nodes = np.array(graph.nodes.T, order="C")
 
     def draw() -> Floats:
         return points[rng.integers(len(points), size=params.samples)]
@@ -116,9 +120,9 @@ def fit_som(
             radius = params.radius_at(epoch)
             theta = neighbourhood(undirected, radius)
         _epoch(nodes, draw(), theta, params.rate_at(epoch))
-        if epoch % max(1, params.epochs // 20) == 0 or epoch == params.epochs - 1:
-            history.append(quantisation_error_mm(nodes, points))
-    return graph.with_nodes(nodes), tuple(history)
+        if epoch % max(1, params.epochs // 10) == 0 or epoch == params.epochs - 1:
+            history.append(quantisation_error_mm(nodes.T, points))
+    return graph.with_nodes(nodes.T), tuple(history)
 
 
 def quantisation_error_mm(nodes: Floats, points: Floats) -> float:

@@ -22,13 +22,13 @@ def template_graph(frame: ChestFrame) -> SkeletonGraph:
     numbers: dict[tuple[Part, int, int], int] = {}
     nodes: list[Floats] = []
     rows, columns = STERNUM_SHAPE
-    pitch_up = frame.length_mm / rows
     pitch_left = frame.width_mm / columns
+    heights = {side: _row_heights_mm(frame, (side,)) for side in ("right", "left")}
+    heights[""] = _row_heights_mm(frame, ("right", "left"))
 
     def add(part: Part, row: int, column: int, left_mm: float) -> None:
         numbers[part, row, column] = len(nodes)
-        up_mm = frame.length_mm / 2 - (row + 0.5) * pitch_up
-        nodes.append(frame.origin + left_mm * frame.left + up_mm * frame.up)
+        nodes.append(frame.origin + left_mm * frame.left + heights[part.side][row] * frame.up)
 
     for row in range(rows):
         for column in range(columns):
@@ -56,3 +56,16 @@ def template_graph(frame: ChestFrame) -> SkeletonGraph:
                 edges.append((above, node))
     parts = np.array([int(part) for part, _, _ in numbers], dtype=np.int64)
     return SkeletonGraph(np.array(nodes), np.array(edges, dtype=np.int64), parts)
+
+
+def _row_heights_mm(frame: ChestFrame, sides: tuple[str, ...]) -> Floats:
+    """Height of every grid row: each level's middle row at the measured root of its cartilage, the others between."""
+    middle = np.array([rows[1] for rows in BRANCH_ROWS.values()], dtype=np.float64)
+    roots = np.array(
+        [np.mean([frame.root_mm[Part.cartilage(side, level)] for side in sides]) for level in BRANCH_ROWS]
+    )
+    pitch = (roots[-1] - roots[0]) / (middle[-1] - middle[0])
+    rows = np.arange(STERNUM_SHAPE[0], dtype=np.float64)
+    heights = np.interp(rows, middle, roots)
+    heights += pitch * (np.minimum(rows - middle[0], 0.0) + np.maximum(rows - middle[-1], 0.0))
+    return heights

@@ -240,7 +240,8 @@ class ChestFrame:
     Attributes:
         origin: (3,) mm, centre of the sternum.
         left, up, front: (3,) unit vectors, orthogonal; left is the patient's, so left × up = front.
-        length_mm, width_mm: sternum along ``up`` and ``left``.
+        width_mm: sternum along ``left``.
+        root_mm: height of each cartilage's root along ``up``, by part.
         reach_mm: how far each cartilage extends from the sternum's edge along ``left``, by part.
     """
 
@@ -248,8 +249,8 @@ class ChestFrame:
     left: Floats
     up: Floats
     front: Floats
-    length_mm: float
     width_mm: float
+    root_mm: Mapping[Part, float]
     reach_mm: Mapping[Part, float]
 
     @property
