@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike
 from study.coarse import Alignment, align
 from study.errors import StudyError
 from study.methods import METHODS
-from study.types import Method, PointCloud, Registration
+from study.types import Method, PointCloud, Registration, as_points
 
 
 def named_rng(seed: int, name: str) -> np.random.Generator:
     """A generator that depends on what is computed, not on when: seed plus a checksum of the name."""
+    if seed < 0:
+        raise StudyError(f"expected a seed of 0 or more, got {seed}")
     return np.random.default_rng([seed, crc32(name.encode())])
 
 
@@ -62,5 +64,5 @@ def register_pair(
         StudyError: bad arrays, no sternum, a missing branch, an unknown method.
     """
     chosen = find_method(method)
-    alignment = align(PointCloud(np.asarray(ct_points), "ct"), PointCloud(np.asarray(us_points), "us"))
+    alignment = align(PointCloud(as_points(ct_points, "ct"), "ct"), PointCloud(as_points(us_points, "us"), "us"))
     return register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"))
