@@ -20,8 +20,10 @@ from study.results import (
     paper_waypoints,
     provenance,
     read_metrics,
+    run_folder,
     sha256_of,
     waypoint_summary,
+    why_stale,
     write_hd_table,
     write_json,
     write_metrics,
@@ -315,3 +317,30 @@ def test_timings_are_sorted(tmp_path):
     write_timings([{**row, "stage": "register"}, {**row, "stage": "align"}], tmp_path / "timings.csv")
     lines = (tmp_path / "timings.csv").read_text().splitlines()
     assert [line.split(",")[5] for line in lines] == ["stage", "align", "register"]
+
+
+def test_a_run_goes_stale_with_its_code_its_parameters_and_its_seed(tmp_path):
+    code = tmp_path / "src" / "study" / "som.py"
+    code.parent.mkdir(parents=True)
+    code.write_text("rate = 0.1\n")
+    run, now = tmp_path / "run", datetime(2024, 1, 1, tzinfo=UTC)
+    parameters = {"methods": {"icp": Icp()}}
+
+    def why(parameters=parameters, seed=0):
+        return why_stale(run, parameters, seed, tmp_path)
+
+    assert "no run" in why()
+    write_metrics(metric_rows("phantom", "ct1", "patient", "icp", 0, {"hd": 1.0}), run / "metrics.csv")
+    assert "cannot be read" in why()
+    write_json(provenance(parameters, 0, {}, now, now, tmp_path), run / "provenance.json")
+    assert why() is None
+    assert "the seed" in why(seed=1)
+    assert "list of methods" in why({"methods": {"icp": Icp(max_iterations=3)}})
+    code.write_text("rate = 0.2\n")
+    assert "the code" in why()
+
+
+def test_only_the_whole_study_at_seed_0_is_kept_as_the_run_of_a_dataset():
+    folders = {run_folder(*chosen) for chosen in [("open", "full", 0), ("open", "quick", 0), ("open", "full", 1)]}
+    assert len(folders) == 3
+    assert {path.parent.name for path in folders} == {"runs", "trials"}

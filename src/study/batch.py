@@ -28,7 +28,9 @@ from study.results import (
     failed_row,
     metric_rows,
     provenance,
+    read_metrics,
     sha256_of,
+    why_stale,
     write_hd_table,
     write_json,
     write_metrics,
@@ -267,13 +269,33 @@ def run_study(
     )
     write_metrics(rows, out / "metrics.csv")
     write_timings(timings, out / "timings.csv")
-    chosen = list(METHODS) if methods is None else list(methods)
-    parameters = {"study": asdict(params), "methods": {name: asdict(METHODS[name]) for name in chosen}}
+    parameters = run_parameters(params, methods)
     inputs = {"data_manifest.yaml": sha256_of(manifest.path)}
     if dataset in manifest.cohorts:
         inputs |= {key: file.sha256 for key, file in manifest.files_of(dataset).items() if file.sha256}
     write_json(provenance(parameters, seed, inputs, started, datetime.now(UTC)), out / "provenance.json")
     write_tables(pd.DataFrame(rows), out)
+
+
+def run_parameters(params: StudyParams, methods: Iterable[str] | None = None) -> dict[str, Any]:
+    """Every parameter of a run, for its provenance."""
+    chosen = list(METHODS) if methods is None else list(methods)
+    return {"study": asdict(params), "methods": {name: asdict(METHODS[name]) for name in chosen}}
+
+
+def load_or_run(
+    dataset: str, params: StudyParams, folder: Path, *, seed: int = 0, n_jobs: int = 1, show_progress: bool = False
+) -> tuple[pd.DataFrame, str]:
+    """The metrics of a dataset: those in ``folder`` if the code and parameters of now made them, else of a new run.
+
+    Returns:
+        rows as `read_metrics` gives them, and a sentence that says where they are from.
+    """
+    reason = why_stale(folder, run_parameters(params), seed)
+    if reason is not None:
+        run_study(dataset, params, folder, seed=seed, n_jobs=n_jobs, show_progress=show_progress)
+    metrics = read_metrics(folder / "metrics.csv")
+    return metrics, "loaded: code, parameters and seed are those of now" if reason is None else f"run now: {reason}"
 
 
 def write_tables(metrics: pd.DataFrame, out: Path) -> None:

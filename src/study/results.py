@@ -38,6 +38,10 @@ CASE = "case"  # the metric of a failed case's one row
 
 ROOT = Path(__file__).parents[2]  # of a checkout
 PAPER = ROOT / "results" / "paper"
+RUNS = ROOT / "results" / "runs"
+TRIALS = ROOT / "results" / "trials"
+REFERENCE = ROOT / "results" / "reference"
+CODE = ("src", "annotations", "data_manifest.yaml", "environment.lock")  # what decides a run's numbers
 PAPER_DATA = "paper (other data)"
 
 Row = dict[str, Any]
@@ -47,11 +51,16 @@ Row = dict[str, Any]
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write ``text`` as UTF-8 with LF, through a temporary file: a killed run leaves the old file or none."""
+    """Write ``text`` as UTF-8 with LF; see `write_bytes`."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, a picture for one, through a temporary file: a killed run leaves the old file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_bytes(content)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -206,6 +215,7 @@ def provenance(
         "commit": _git(root, "rev-parse", "HEAD"),
         # Results are written inside the checkout and say nothing about the code.
         "uncommitted_changes": _git(root, "status", "--porcelain", "--", ".", ":!results", ":!notebooks"),
+        "code_sha256": code_sha256(root),
         "lock_sha256": sha256_of(lock) if lock.is_file() else None,
         "inputs_sha256": dict(inputs),
         "parameters": dict(parameters),
@@ -223,9 +233,47 @@ def provenance(
     }
 
 
+def code_sha256(root: Path = ROOT) -> str:
+    """One SHA-256 of every file that decides a run's numbers: package, annotations, manifest and lock."""
+    found = [path for name in CODE for path in (root / name, *(root / name).rglob("*")) if path.is_file()]
+    files = sorted(path.relative_to(root).as_posix() for path in found if "__pycache__" not in path.parts)
+    lines = [f"{sha256_of(root / name)}  {name}\n" for name in files]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def run_folder(dataset: str, profile: str, seed: int) -> Path:
+    """Where the run of a dataset is kept; what is not the whole study at seed 0 stays apart from it."""
+    return RUNS / dataset if (profile, seed) == ("full", 0) else TRIALS / f"{dataset}-{profile}-seed{seed}"
+
+
+def why_stale(folder: Path, parameters: Mapping[str, Any], seed: int, root: Path = ROOT) -> str | None:
+    """Why the run in a folder cannot stand for a run made now; None when it can.
+
+    Args:
+        folder: with ``metrics.csv`` and ``provenance.json``.
+        parameters: as given to `provenance`.
+        seed: the run's seed.
+        root: the checkout whose code would run.
+    """
+    if not (folder / "metrics.csv").is_file():
+        return "there is no run yet"
+    try:
+        before = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        return f"its provenance.json cannot be read: {error}"
+    now = {"code_sha256": code_sha256(root), "seed": seed, "parameters": json.loads(_json(parameters))}
+    words = {"code_sha256": "the code", "seed": "the seed", "parameters": "a parameter or the list of methods"}
+    changed = [words[name] for name, value in now.items() if before.get(name) != value]
+    return f"since it was made, {' and '.join(changed)} changed" if changed else None
+
+
+def _json(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, indent=2, sort_keys=True, allow_nan=False, default=_plain) + "\n"
+
+
 def write_json(content: Mapping[str, Any], path: Path) -> None:
     """Write JSON with sorted keys; numpy values, paths and dataclasses are taken apart."""
-    write_text(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=False, default=_plain) + "\n")
+    write_text(path, _json(content))
 
 
 def _plain(value: Any) -> Any:
@@ -420,8 +468,7 @@ def write_latex(display: pd.DataFrame, path: Path, caption: str, note: str) -> N
     escaped = note.replace("_", r"\_").replace("%", r"\%").replace("&", r"\&")
     write_text(
         path,
-        "\\begin{table}\n\\centering\n"
-        f"\\caption{{{caption}}}\n{body}\\par\\footnotesize {escaped}\n\\end{{table}}\n",
+        f"\\begin{{table}}\n\\centering\n\\caption{{{caption}}}\n{body}\\par\\footnotesize {escaped}\n\\end{{table}}\n",
     )
 
 
@@ -449,19 +496,21 @@ def waypoint_summary(metrics: pd.DataFrame) -> pd.DataFrame:
             mine = chosen[(chosen["metric"] == metric) & (chosen["method"] == method)]
             values = mine["value"].to_numpy()
             reported = metric == "waypoint_error" and method in paper.index
-            rows.append({
-                "metric": metric,
-                "method": method,
-                "mean": values.mean() if values.size else np.nan,
-                "sd": population_sd(values) if values.size else np.nan,
-                "median": np.median(values) if values.size else np.nan,
-                "max": values.max() if values.size else np.nan,
-                "n_waypoints": values.size,
-                "n_cases": len(mine.drop_duplicates(list(KEY[:5]))),
-                "n_failed": int(failed.get(method, 0)),
-                "paper_mean": paper["mean"].get(method) if reported else np.nan,
-                "paper_sd": paper["sd"].get(method) if reported else np.nan,
-            })
+            rows.append(
+                {
+                    "metric": metric,
+                    "method": method,
+                    "mean": values.mean() if values.size else np.nan,
+                    "sd": population_sd(values) if values.size else np.nan,
+                    "median": np.median(values) if values.size else np.nan,
+                    "max": values.max() if values.size else np.nan,
+                    "n_waypoints": values.size,
+                    "n_cases": len(mine.drop_duplicates(list(KEY[:5]))),
+                    "n_failed": int(failed.get(method, 0)),
+                    "paper_mean": paper["mean"].get(method) if reported else np.nan,
+                    "paper_sd": paper["sd"].get(method) if reported else np.nan,
+                }
+            )
     return pd.DataFrame(rows)
 
 
