@@ -295,3 +295,83 @@ def _strip(
                 ax.plot([values.min(), values.max()], [y + aside] * 2, color=edge, lw=1, alpha=0.6)
                 ax.scatter(values, np.full(len(values), y + aside), s=6, c=edge, lw=0, alpha=0.6)
             ax.scatter(values.mean(), y + aside, s=38, marker=marker, fc=face, ec=edge, lw=1.1, zorder=4)
+
+
+def error_views(metrics: pd.DataFrame, views: Sequence[str], *, note: str = SIMULATED) -> Figure:
+    """The same transferred waypoints, judged in several ways: a panel a metric, a row a method.
+
+    Args:
+        metrics: rows of one dataset, as ``results.read_metrics`` gives them.
+        views: metrics of waypoints, in the order of the panels; one the dataset does not have is left out.
+        note: where the patient is from.
+
+    Raises:
+        StudyError: several datasets, or none of the metrics.
+    """
+    _table(metrics, ("dataset", "subject", "target", "method", "metric", "value"), "rows of metrics.csv")
+    known = [view for view in views if view in set(metrics["metric"])]
+    require(known, f"rows of a metric among {', '.join(views)}")
+    *_, methods = _cases(metrics, known[0])
+    cases = metrics[metrics["metric"].isin(known)].groupby(["subject", "target", "seed", "method", "metric"])["value"]
+    means = cases.mean().reset_index()
+    figure = new_figure(1.6 + 0.34 * len(methods), f"The same waypoints, judged in {len(known)} ways ({note})")
+    panels = np.atleast_1d(figure.subplots(1, len(known), sharex=True, sharey=True))
+    for ax, view in zip(panels, known, strict=True):
+        for y, method in enumerate(methods):
+            values = means.loc[(means["metric"] == view) & (means["method"] == method), "value"].to_numpy()
+            style = method_style(method)
+            if y % 2 == 0:
+                ax.axhspan(y - 0.5, y + 0.5, color="#f3f3f3", lw=0, zorder=0)
+            if len(values):
+                mean, sd = float(values.mean()), population_sd(values)
+                ax.scatter(values, np.full(len(values), y + 0.2), s=8, c=style.colour, alpha=0.6, lw=0)
+                line: dict[str, Any] = {"mfc": style.face, "mec": style.colour, "ecolor": style.colour, "ms": 7}
+                ax.errorbar(mean, y - 0.08, xerr=sd, fmt=style.marker, capsize=2.5, zorder=4, **line)
+                right = ax.get_yaxis_transform()
+                ax.text(0.99, y - 0.08, f"{mean:.1f}", transform=right, ha="right", va="center", fontsize=8)
+        title = METRICS[view].title if view in METRICS else view
+        ax.grid(axis="x", alpha=0.3)
+        plain(ax, title.replace(" in the feature plane", ",\nin the feature plane"))
+        ax.set_xlabel("mm; dot: a case's mean", fontsize=8)
+    # Room for the means that are written at the right.
+    panels[0].set_xlim(0, 1.28 * float(means["value"].max()))
+    panels[0].set_yticks(range(len(methods)), [method_style(method).label for method in methods])
+    panels[0].set_ylim(len(methods) - 0.5, -0.5)
+    return figure
+
+
+def paired_differences(df: pd.DataFrame, reference: str, unit: str, *, note: str = SIMULATED) -> Figure:
+    """One method against each other on the same cases: a panel a dataset, a row a method, a dot a case.
+
+    Args:
+        df: columns ``dataset``, ``method`` (the other), ``difference`` (``reference`` minus the other, a row a case).
+        reference: the method compared.
+        unit: what the difference is of, for the axis.
+        note: where the patient is from.
+
+    Raises:
+        StudyError: no difference.
+    """
+    _table(df, ("dataset", "method", "difference"), "paired differences")
+    datasets, methods = list(dict.fromkeys(df["dataset"])), in_order(df["method"])
+    label = method_style(reference).label
+    figure = new_figure(1.6 + 0.36 * len(methods), f"{label} against each other method, case by case ({note})")
+    panels = np.atleast_1d(figure.subplots(1, len(datasets), sharex=True, sharey=True))
+    for ax, dataset in zip(panels, datasets, strict=True):
+        mine = df[df["dataset"] == dataset]
+        for y, method in enumerate(methods):
+            values = mine.loc[mine["method"] == method, "difference"].dropna().to_numpy()
+            style = method_style(method)
+            if y % 2 == 0:
+                ax.axhspan(y - 0.5, y + 0.5, color="#f3f3f3", lw=0, zorder=0)
+            if len(values):
+                ax.scatter(values, np.full(len(values), y + 0.2), s=8, c=style.colour, alpha=0.6, lw=0)
+                line: dict[str, Any] = {"mfc": style.face, "mec": style.colour, "ecolor": style.colour, "ms": 7}
+                ax.errorbar(values.mean(), y - 0.08, xerr=population_sd(values), fmt=style.marker, capsize=2.5, **line)
+        ax.axvline(0, color=DARK, lw=1)
+        ax.grid(axis="x", alpha=0.3)
+        plain(ax, f"{dataset}, n = {mine.groupby('method').size().max()} cases")
+        ax.set_xlabel(f"{label} better ←  {unit}  → worse", fontsize=8)
+    panels[0].set_yticks(range(len(methods)), [method_style(method).label for method in methods])
+    panels[0].set_ylim(len(methods) - 0.5, -0.5)
+    return figure
