@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
-from oracles import bend, check_contract, contract_pair, toy_chest
+from oracles import bend, check_contract, check_tuned, contract_pair, toy_chest
 
 from study.errors import StudyError
 from study.methods import nonrigid_icp
@@ -91,3 +91,7 @@ def test_a_surface_out_of_reach_is_refused():
 def test_bad_parameters_are_refused(bad):
     with pytest.raises(StudyError, match="nonrigid_icp: expected"):
         NonrigidIcp(**bad)
+
+
+def test_the_tuned_setting_is_the_best_of_the_recorded_grid():
+    check_tuned(NonrigidIcp.tuned())

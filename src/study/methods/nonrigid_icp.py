@@ -66,6 +66,14 @@ class NonrigidIcp:
                 f"got {self.max_vertices} and {self.distance_threshold}"
             )
 
+    @classmethod
+    def tuned(cls) -> NonrigidIcp:
+        """The best row of ``results/tuning/nonrigid_icp.csv`` (benchmarks/tune_baselines.py): the library's defaults.
+
+        No schedule, stiffness, ``gamma`` or threshold of the grid beat them on the development subjects.
+        """
+        return cls()
+
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Bend ``source`` onto ``target``; nothing is drawn from ``rng``.
 
