@@ -30,6 +30,8 @@ GRID_MM = 1.0  # all of this is done on an isotropic grid, so that voxels are mi
 MARGIN_MM = 25.0  # around the landmarks
 AIR_HU = -200.0  # a chest CT in Hounsfield units has lung and room air far below this
 JOINT_MM = 4.0  # a line's last cross-section runs on this far, to meet the sternum all around
+ATTACHED_MM = 8  # a recorded attachment is that close to the bone it belongs to
+MAX_LENGTH_MM = 130.0  # of a cartilage, end to end
 N_RAYS = 36
 RAY_MM = np.arange(0.5, 12.01, 0.5)
 
@@ -183,12 +185,13 @@ def find_sternum(image: Volume, line: Floats, growth: Growth) -> Bools:
         if len(rows) < 3:
             rows = closed[np.abs(closed - slice_).argsort()[:3]]
         field[:, :, slice_] = np.median(outline[:, :, rows], axis=2)
-    return _largest(ndimage.gaussian_filter(field, 1.0) > 0)
+    return _largest(ndimage.gaussian_filter(field, (1.0, 1.0, 3.0)) > 0)
 
 
 def _grow(ct: Volume, landmarks: Landmarks, growth: Growth, ribs: Volume | None) -> Volume:
     points = np.vstack([*landmarks.junctions.values(), *landmarks.attachments.values(), landmarks.sternum])
     image = _isotropic(ct, points)
+    _check_in_tissue(image, landmarks)
     sternum = find_sternum(image, landmarks.sternum, growth)
     bone = np.zeros(image.shape, dtype=bool) if ribs is None else _on_grid(ribs, image)
     cost = _path_cost(image, bone, growth)
@@ -200,8 +203,11 @@ def _grow(ct: Volume, landmarks: Landmarks, growth: Growth, ribs: Volume | None)
     low, high = growth.window_hu
     soft = ndimage.gaussian_filter(image.values.clip(low, high), 0.7)
     for part in CARTILAGES:
+        end = np.rint(image.to_index(landmarks.attachments[part])).astype(int)
         goal = np.zeros(image.shape, dtype=bool)
-        goal[tuple(np.rint(image.to_index(landmarks.attachments[part])).astype(int))] = True
+        near = tuple(slice(max(i - ATTACHED_MM, 0), i + ATTACHED_MM + 1) for i in end)
+        goal[near] = sternum[near]
+        goal[tuple(end)] |= not goal.any()
         line = _cheapest_path(image, cost, landmarks.junctions[part], goal, part)
         tube = _tube(soft, line, front, growth) & ~sternum & ~bone & (parts == Part.UNKNOWN)
         parts[_largest(ndimage.binary_opening(tube))] = part
@@ -265,6 +271,19 @@ def _line_frame(line: Floats, front: Floats) -> tuple[Floats, Floats, Floats]:
     return along, across, np.cross(across, along)
 
 
+def _check_in_tissue(image: Volume, landmarks: Landmarks) -> None:
+    """A cartilage's ends lie in tissue, not in fat, lung or air."""
+    smooth = ndimage.gaussian_filter(image.values.clip(-200, 400), 3.0)
+    for what, points in (("junction", landmarks.junctions), ("attachment", landmarks.attachments)):
+        for part, point in points.items():
+            density = ndimage.map_coordinates(smooth, image.to_index(point)[:, None], order=1, mode="nearest")[0]
+            if density < 0.0:
+                raise StudyError(
+                    f"{image.name}: expected cartilage or bone at the {what} of {part.name.lower()}, got "
+                    f"{density:.0f} HU at {np.round(point, 1).tolist()} mm (fat or lung); check the landmark, its frame and the orientation"
+                )
+
+
 def _path_cost(image: Volume, ribs: Bools, growth: Growth) -> Floats:
     smooth = ndimage.gaussian_filter(image.values.clip(-200, 400), 2.0)
     cost = 1 + 30 / (1 + np.exp((smooth - growth.muscle_hu + 20) / 10))
@@ -276,14 +295,19 @@ def _path_cost(image: Volume, ribs: Bools, growth: Growth) -> Floats:
 def _cheapest_path(image: Volume, cost: Floats, start_mm: Floats, goal: Bools, part: Part) -> Floats:
     """Middle line (n, 3), voxels of the grid, 1 mm apart, from a rib's end to the cheapest goal voxel."""
     start = np.rint(image.to_index(start_mm)).astype(int)
-    mcp = MCP_Geometric(cost)
-    reach, _ = mcp.find_costs([tuple(start)], np.argwhere(goal), find_all_ends=False)  # stops at the first goal
-    end = np.unravel_index(np.where(goal, reach, np.inf).argmin(), reach.shape)
-    path = np.array(mcp.traceback(end), dtype=np.float64)
-    if not 8.0 <= len(path) <= 160.0:
+    goals = np.argwhere(goal)
+    goals = goals[np.linalg.norm(goals - start, axis=1) < MAX_LENGTH_MM]
+    if len(goals) == 0:
         raise StudyError(
-            f"{image.name}: expected a cartilage {part.name.lower()} of 8-160 mm, got a path of {len(path)} mm"
+            f"{image.name}: expected the sternum within {MAX_LENGTH_MM:g} mm of the rib's end of {part.name.lower()}, "
+            "got none; check its landmarks or labels"
         )
+    low = np.maximum(np.minimum(goals.min(axis=0), start) - 15, 0)
+    high = np.maximum(goals.max(axis=0), start) + 16
+    mcp = MCP_Geometric(cost[tuple(slice(a, b) for a, b in zip(low, high, strict=True))])
+    reach, _ = mcp.find_costs([tuple(start - low)], goals - low, find_all_ends=False)  # stops at the first goal
+    end = goals[reach[tuple((goals - low).T)].argmin()]
+    path = np.array(mcp.traceback(tuple(end - low)), dtype=np.float64) + low
     smooth = gaussian_filter1d(path, 5, axis=0, mode="nearest")
     smooth[[0, -1]] = path[[0, -1]]
     core = np.rint(smooth[len(path) // 5 : -max(len(path) // 5, 1)]).astype(int)
