@@ -18,7 +18,6 @@ from study.figures.style import (
     dots,
     draw_surface,
     look,
-    mark_sides,
     name_parts,
     new_figure,
     part_colours,
@@ -74,10 +73,9 @@ def _grey_image(ax: Axes, values: ArrayLike, x: Floats, y: Floats, window: tuple
 
 
 def _best_slice(mask: Volume, axis: int) -> int:
-    """The slice that shows most parts, and of those the one that shows most of them."""
+    """The slice that shows most: many parts count as much as large ones, hence the root of each part's area."""
     planes = np.moveaxis(mask.values, axis, 0).reshape(mask.shape[axis], -1)
-    n_parts = np.sum([(planes == part).any(axis=1) for part in _DRAWN], axis=0)
-    return int(np.lexsort(((planes >= 0).sum(axis=1), n_parts))[-1])
+    return int(np.argmax(np.sum([np.sqrt((planes == part).sum(axis=1)) for part in _DRAWN], axis=0)))
 
 
 def ct_slice(
@@ -95,7 +93,7 @@ def ct_slice(
         volume: Hounsfield units, axes along R, A, S.
         mask: `Part` values on the same grid or a crop of it.
         reference: other parts on the grid of ``mask``, dashed.
-        at_mm: (3,) RAS+ place the slices go through; without it, where most parts are seen.
+        at_mm: (3,) RAS+ place the slices go through; without it, where most of them is seen.
         window_hu: darkest and brightest value.
         margin_mm: shown around the mask.
 
@@ -127,9 +125,8 @@ def ct_slice(
         )
         extent = np.array([[min(xa, xb) - margin_mm, ya - margin_mm], [max(xa, xb) + margin_mm, yb + margin_mm]])
         place = _grid_mm(volume, axis)[first[axis] + cut[axis]]
-        look(ax, "front", extent, f"{title}, {'S' if axis == 2 else 'A'} = {place:.1f} mm")
+        look(ax, "front", extent, f"{title}, {'S' if axis == 2 else 'A'} = {place:.1f} mm", on_dark=True)
         ax.set_ylabel("to the front (mm)" if up == 1 else "up (mm)", fontsize=8)
-        mark_sides(ax, "white")
     part_legend(figure)
     return figure
 
@@ -166,8 +163,7 @@ def anatomy_overview(
         flat = (mask.values >= 0).any(axis=1)
         seen = np.column_stack([mine[0][np.nonzero(flat)[0]], mine[1][np.nonzero(flat)[1]]])
         spacing = " × ".join(f"{s:.2g}" for s in volume.spacing_mm)
-        look(ax, "front", bounds(seen, margin_mm=30.0), f"{name} ({spacing} mm)")
-        mark_sides(ax, "white")
+        look(ax, "front", bounds(seen, margin_mm=30.0), f"{name} ({spacing} mm)", on_dark=True)
     for ax in grid[len(subjects) :]:
         ax.set_axis_off()
     part_legend(figure)
@@ -182,7 +178,7 @@ def mesh_and_cloud(mesh: Mesh, cloud: PointCloud, *, T_cloud_chest: RigidTransfo
         T_cloud_chest: chest coordinates to that frame; None for RAS+.
     """
     vertices, points = (project(p, "front", T_cloud_chest) for p in (mesh.vertices, cloud.points))
-    extent = bounds(vertices, points)
+    extent = bounds(vertices, points, margin_mm=16.0)
     figure = new_figure(4.6, f"{mesh.name}: surface and the cloud sampled from it")
     left, right = figure.subplots(1, 2)
     draw_surface(left, vertices, mesh.faces, part_colours(mesh.parts, len(vertices)))

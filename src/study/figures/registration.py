@@ -350,7 +350,8 @@ def transferred_path(
     extent = bounds(cloud, goal, *(project(p, "front", T_us_chest) for p in transferred.values()))
     wide, tall = np.ptp(extent, axis=0)
     title = f"{len(truth)} waypoints from CT to US ({note})"
-    figure = new_figure(0.9 + rows * ((WIDTH_IN - 0.9) / columns * tall / wide + 0.4), title)
+    panel_in = min(WIDTH_IN - 0.9, 6.5 * columns) / columns  # one method alone need not fill the page
+    figure = new_figure(0.9 + rows * (panel_in * tall / wide + 0.4), title)
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax, method in zip(grid, methods, strict=False):
         style = method_style(method)

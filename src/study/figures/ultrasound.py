@@ -141,13 +141,18 @@ def latency_fit(
         heights: (p,) mm.
         robot_times: (p,) s.
         latency_s: the latency found.
+
+    Raises:
+        StudyError: no depth inside the robot's recording.
     """
     depth, t_image, height, t_robot = (
         np.asarray(a, dtype=np.float64) for a in (depths, image_times, heights, robot_times)
     )
-    seen = np.isfinite(depth)
-    require(np.flatnonzero(seen), "depths")
     require(t_robot, "heights")
+    # Only frames that the robot's recording covers with and without the latency can be judged.
+    late, early = max(0.0, latency_s), min(0.0, latency_s)
+    seen = np.isfinite(depth) & (t_image - late >= t_robot[0]) & (t_image - early <= t_robot[-1])
+    require(np.flatnonzero(seen), "depths inside the robot's recording")
     # Depths are brought to the height's scale by the fit at the latency found; the clock changes only the place.
     moved = np.interp(t_image[seen] - latency_s, t_robot, height)
     slope, offset = np.polyfit(depth[seen], moved, 1)
