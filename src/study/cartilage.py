@@ -73,7 +73,7 @@ def find_branches(points: Floats, height_mm: float, name: str = "cloud") -> Bran
     image, pixels, origin = pixelise(points, PIXEL_MM, pad=4)
     image = close_gaps(image, round(2 * sample_spacing_mm(points) / PIXEL_MM))
     x = np.arange(image.shape[0])[:, None] * PIXEL_MM + origin[0]
-    edges = tuple(sternum_edge_mm(points, height_mm, sign) for sign in (-1, 1))
+    edges = (sternum_edge_mm(points, height_mm, -1), sternum_edge_mm(points, height_mm, 1))
     sternum = (x >= -edges[0]) & (x <= edges[1])
     markers = np.zeros(image.shape, dtype=np.int64)
     seeds = []
@@ -101,7 +101,8 @@ def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> Floats:
         candidates = np.argwhere(image & (outwards_mm >= near) & (outwards_mm <= far))
         if len(candidates) < 8:
             break
-        clusters = KMeans(n_clusters=4, n_init=4, random_state=0).fit(candidates)
+        quarters = np.array_split(candidates[np.argsort(candidates[:, 1], kind="stable")], 4)
+        clusters = KMeans(n_clusters=4, init=np.array([quarter.mean(axis=0) for quarter in quarters])).fit(candidates)
         seeds = []
         for k in np.argsort(clusters.cluster_centers_[:, 1]):
             members = candidates[clusters.labels_ == k]

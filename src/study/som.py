@@ -10,9 +10,10 @@ from numba import njit
 from scipy.spatial import KDTree
 
 from study.errors import StudyError
-from study.types import Floats, Ints, SkeletonGraph
+from study.types import Floats, Ints, Part, PointCloud, SkeletonGraph
 
 RateSchedule = Literal["constant", "linear", "compounding"]
+Winners = Literal["any", "own_part"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class SomParams:
         samples: points drawn per epoch.
         rate: learning rate l_r of the main epochs (0.1 in the paper).
         rate_schedule: ``"constant"`` (the paper), ``"linear"`` to 0, or ``"compounding"`` (the authors' code).
-        radius: start of the neighbourhood radius in hops; it falls to 1.
+        radius: start of the neighbourhood radius in hops; it falls to 1. The paper states none.
+        winners: ``"any"`` node may win a point (the paper); ``"own_part"`` only those of the point's labelled part.
         pretrain_epochs, pretrain_rate: epochs on the directed graph (3 at 0.02 in the paper).
     """
 
@@ -32,7 +34,8 @@ class SomParams:
     samples: int = 500
     rate: float = 0.1
     rate_schedule: RateSchedule = "constant"
-    radius: float = 5.0
+    radius: float = 3.0
+    winners: Winners = "any"
     pretrain_epochs: int = 3
     pretrain_rate: float = 0.02
 
@@ -45,6 +48,8 @@ class SomParams:
             )
         if self.rate_schedule not in ("constant", "linear", "compounding"):
             raise StudyError(f"expected rate_schedule constant|linear|compounding, got {self.rate_schedule!r}")
+        if self.winners not in ("any", "own_part"):
+            raise StudyError(f"expected winners any|own_part, got {self.winners!r}")
 
     def rate_at(self, epoch: int) -> float:
         """Learning rate of a main epoch."""
@@ -67,15 +72,16 @@ def neighbourhood(hops: Ints, radius: float) -> Floats:
 
 
 @njit(cache=True)
-def _epoch(nodes, points, theta, rate):  # type: ignore[no-untyped-def]
+def _epoch(nodes, points, classes, barred, theta, rate):  # type: ignore[no-untyped-def]
     # nodes is (3, m): one coordinate after the other lets the compiler take several nodes at a time.
     m = nodes.shape[1]
     x, y, z = nodes[0], nodes[1], nodes[2]
     apart = np.empty(m)
     for k in range(points.shape[0]):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        bar = barred[classes[k]]
         for s in range(m):
-            apart[s] = (px - x[s]) ** 2 + (py - y[s]) ** 2 + (pz - z[s]) ** 2
+            apart[s] = (px - x[s]) ** 2 + (py - y[s]) ** 2 + (pz - z[s]) ** 2 + bar[s]
         winner = 0
         for s in range(1, m):
             if apart[s] < apart[winner]:
@@ -89,15 +95,15 @@ def _epoch(nodes, points, theta, rate):  # type: ignore[no-untyped-def]
 
 
 def fit_som(
-    graph: SkeletonGraph, points: Floats, params: SomParams, rng: np.random.Generator
+    graph: SkeletonGraph, cloud: PointCloud, params: SomParams, rng: np.random.Generator
 ) -> tuple[SkeletonGraph, tuple[float, ...]]:
-    """Pull ``graph`` onto ``points`` by Eq. 2, one drawn point at a time (sec. III-B).
+    """Pull ``graph`` onto ``cloud`` by Eq. 2, one drawn point at a time (sec. III-B).
 
     Pre-training runs on the directed graph, the rest on the undirected one.
 
     Args:
         graph: start positions and topology, mm.
-        points: (n, 3) mm, same frame.
+        cloud: (n, 3) mm, same frame; labelled where ``params.winners`` asks for parts.
         params: the schedule.
         rng: draws the points.
 
@@ -106,23 +112,37 @@ def fit_som(
         at ten even steps.
     """
     nodes = np.array(graph.nodes.T, order="C")
+    points = cloud.points
+    classes, barred = _barred(graph, cloud, params.winners)
 
-    def draw() -> Floats:
-        return points[rng.integers(len(points), size=params.samples)]
+    def train(theta: Floats, rate: float) -> None:
+        drawn = rng.integers(len(points), size=params.samples)
+        _epoch(nodes, points[drawn], classes[drawn], barred, theta, rate)
 
     theta = neighbourhood(graph.hops(directed=True), params.radius)
     for _ in range(params.pretrain_epochs):
-        _epoch(nodes, draw(), theta, params.pretrain_rate)
+        train(theta, params.pretrain_rate)
     undirected = graph.hops(directed=False)
     radius, history = np.nan, []
     for epoch in range(params.epochs):
         if params.radius_at(epoch) != radius:
             radius = params.radius_at(epoch)
             theta = neighbourhood(undirected, radius)
-        _epoch(nodes, draw(), theta, params.rate_at(epoch))
+        train(theta, params.rate_at(epoch))
         if epoch % max(1, params.epochs // 10) == 0 or epoch == params.epochs - 1:
             history.append(quantisation_error_mm(nodes.T, points))
     return graph.with_nodes(nodes.T), tuple(history)
+
+
+def _barred(graph: SkeletonGraph, cloud: PointCloud, winners: Winners) -> tuple[Ints, Floats]:
+    """Class (n,) of each point and, by class, infinity (m,) at the nodes that may not win it."""
+    if winners == "any":
+        return np.zeros(len(cloud), dtype=np.int64), np.zeros((1, len(graph)))
+    if cloud.parts is None:
+        raise StudyError(f"{cloud.name}: expected labelled parts for winners 'own_part', got none; align first")
+    barred = np.where(graph.parts[None] == np.arange(len(Part) - 1)[:, None], 0.0, np.inf)
+    free = np.zeros((1, len(graph)))  # a point of unknown part may be won by any node
+    return np.where(cloud.parts == Part.UNKNOWN, len(barred), cloud.parts), np.vstack([barred, free])
 
 
 def quantisation_error_mm(nodes: Floats, points: Floats) -> float:

@@ -96,7 +96,10 @@ def _best_place(
     points: Floats, scale_mm: float, angles: Floats, near: Floats | None, params: SternumParams, close_mm: float
 ) -> list[SternumFit]:
     """The best position of each rotated template (Eq. 1, by FFT), best rotation first."""
-    pad = int(np.ceil(np.hypot(params.width_mm, params.height_mm) / scale_mm))
+    reach_mm = np.hypot(params.width_mm, params.height_mm)
+    if near is not None:  # what the templates cannot reach need not be convolved
+        points = points[np.linalg.norm(points - near, axis=1) < reach_mm / 2 + 3 * params.scales_mm[0]]
+    pad = int(np.ceil(reach_mm / 2 / scale_mm)) + 1
     image, _, origin = pixelise(points, scale_mm, pad)
     image = close_gaps(image, round(close_mm / scale_mm)).astype(np.float64)
     fits = []

@@ -44,8 +44,8 @@ class SkeletonGraphMethod:
         """
         start = time.perf_counter()
         template = template_graph(chest_frame(source))
-        g_ct, ct_history = fit_som(template, source.points, self.ct_som, rng)
-        g_us, us_history = fit_som(g_ct, target.points, self.us_som, rng)
+        g_ct, ct_history = fit_som(template, source, self.ct_som, rng)
+        g_us, us_history = fit_som(g_ct, target, self.us_som, rng)
         hops = g_ct.hops(directed=False)
         rotations, translations = local_transforms(g_ct.nodes, g_us.nodes, hops, self.n_reg, self.neighbours)
         warped = blend(source.points, g_ct.nodes, rotations, translations, self.blend_k, self.blend_weights)

@@ -1,0 +1,73 @@
+"""A method on the part of the CT surface that ultrasound can see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from study.coarse import chest_frame
+from study.errors import StudyError
+from study.geometry import fit_rigid_batch
+from study.types import Bools, ChestFrame, Floats, Method, PointCloud, Registration
+
+
+def faces_front(points: Floats, frame: ChestFrame, cell_mm: float = 4.0, depth_mm: float = 3.0) -> Bools:
+    """Points (n,) that nothing else hides from the front: within ``depth_mm`` of the foremost of their cell.
+
+    Args:
+        points: (n, 3) mm.
+        frame: the chest's left, up and front.
+        cell_mm: edge of the cells across the view.
+        depth_mm: how far behind the foremost point still counts.
+    """
+    local = frame.T_cloud_chest.inverse.apply(points)
+    cells = np.floor(local[:, :2] / cell_mm).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    foremost = np.full(cell.max() + 1, -np.inf)
+    np.maximum.at(foremost, cell.ravel(), local[:, 2])
+    return local[:, 2] > foremost[cell.ravel()] - depth_mm
+
+
+@dataclass(frozen=True)
+class VisibleSurface:
+    """Run ``method`` on the visible half of the tubes, then carry the hidden half along.
+
+    CT gives a cartilage's whole surface, ultrasound only its front. Matching the whole tube to the visible sheet
+    pulls every point back by about half a thickness; matching like with like does not.
+
+    Attributes:
+        method: what registers the visible points.
+        neighbours: visible points whose rigid motion carries a hidden point.
+    """
+
+    name: ClassVar[str] = "visible_surface"
+
+    method: Method
+    neighbours: int = 12
+
+    def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
+        """Register labelled, coarsely aligned clouds.
+
+        Raises:
+            StudyError: fewer visible points than ``neighbours``, or what ``method`` raises.
+        """
+        seen = faces_front(source.points, chest_frame(source))
+        if seen.sum() < self.neighbours:
+            raise StudyError(f"{source.name}: expected {self.neighbours} visible points or more, got {seen.sum()}")
+        parts = None if source.parts is None else source.parts[seen]
+        result = self.method.register(replace(source, points=source.points[seen], parts=parts), target, rng)
+        warped = np.empty_like(source.points)
+        warped[seen] = result.warped
+        warped[~seen] = carry(source.points[~seen], result.source, result.warped, self.neighbours)
+        return replace(result, source=source.points, warped=warped)
+
+
+def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Floats:
+    """Move each of ``points`` (k, 3) by the rigid motion of its nearest ``source`` (n, 3) to ``warped`` (n, 3)."""
+    _, index = KDTree(source).query(points, k=neighbours)
+    weights = np.full(index.shape, 1 / neighbours)
+    rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
+    return np.einsum("nij,nj->ni", rotations, points) + translations
