@@ -40,6 +40,7 @@ from study.figures.style import (
     plain,
     project,
     require,
+    steps,
     thin,
 )
 from study.geometry import nearest
@@ -302,7 +303,7 @@ def registration_grid(
             dots(ax, project(us, view, T_us_chest), PALE, size=2.5)
             order = thin(len(points))
             seen = project(points[order], view, T_us_chest)
-            drawn = dots(ax, seen, residual[name][order], size=3.5, cmap="viridis", vmin=0, vmax=top)
+            drawn = dots(ax, seen, residual[name][order], size=3.5, cmap=steps("viridis"), vmin=0, vmax=top)
             look(ax, view, extent, title)
             if view == "side":
                 ax.set_ylabel("")

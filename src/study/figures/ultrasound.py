@@ -29,6 +29,7 @@ from study.figures.style import (
     plain,
     project,
     require,
+    steps,
     thin,
 )
 from study.types import (
@@ -80,7 +81,7 @@ def sweep_in_space(
             ax.add_collection(LineCollection(list(pages), colors=DARK, linewidths=0.5, alpha=0.35))
         rows = np.flatnonzero(tracked)[thin(int(tracked.sum()), 3000)]
         line = project(path[rows], view, T_cloud_chest)
-        drawn = ax.scatter(*line[:, :2].T, c=clock[rows], s=4, cmap="plasma", lw=0, rasterized=True)
+        drawn = ax.scatter(*line[:, :2].T, c=clock[rows], s=4, cmap=steps("plasma"), lw=0, rasterized=True)
         look(ax, view, extent, title)
     bar = figure.colorbar(drawn, ax=panels, shrink=0.7, pad=0.01)
     bar.set_label("pose number" if times_s is None else "time of the sweep (s)", fontsize=8)
