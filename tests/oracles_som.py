@@ -94,5 +94,6 @@ def blend_literal(
         closest = sorted(range(len(ct_nodes)), key=lambda i: distance[i])[:k]
         w = [distance[i] if weights == "distance" else 1 / distance[i] for i in closest]
         total = sum(w)
-        moved.append(sum(wi / total * (motions[i][0] @ point + motions[i][1]) for wi, i in zip(w, closest, strict=True)))
+        there = [motions[i][0] @ point + motions[i][1] for i in closest]
+        moved.append(sum(wi / total * place for wi, place in zip(w, there, strict=True)))
     return np.array(moved)

@@ -106,7 +106,7 @@ def test_every_point_lies_in_its_pixel():
     assert np.abs(pixels * 3.0 + origin - points).max() <= 1.5 + 1e-9
     assert image[tuple(pixels.T)].all()
     assert image.sum() == len(np.unique(pixels, axis=0))
-    assert not np.concatenate([image[:2].ravel(), image[-2:].ravel(), image[:, :2].ravel(), image[:, -2:].ravel()]).any()
+    assert image[2:-2, 2:-2].sum() == image.sum()
 
 
 def test_closing_fills_small_gaps_only_and_removes_nothing():

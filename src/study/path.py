@@ -26,10 +26,13 @@ def transfer_path(source: Floats, warped: Floats, waypoints: ArrayLike, *, radiu
         (k, 3) mm in the US frame.
 
     Raises:
-        StudyError: a sphere with fewer than 3 points, or with points on a line.
+        StudyError: clouds that do not pair, or a sphere with fewer than 3 points or with points on a line.
     """
     waypoints = as_points(waypoints, "waypoints")
-    if radius_mm <= 0:
+    source, warped = as_points(source, "source"), as_points(warped, "warped")
+    if source.shape != warped.shape:
+        raise StudyError(f"expected one warped point per source point, got {source.shape} and {warped.shape}")
+    if not radius_mm > 0:
         raise StudyError(f"expected radius_mm > 0, got {radius_mm}")
     moved = np.empty_like(waypoints)
     for k, members in enumerate(KDTree(source).query_ball_point(waypoints, radius_mm)):
