@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from study import __version__
 from study.errors import StudyError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from study.data.manifest import Manifest
 
 DATASETS = "phantom, open, planted, ribseg, totalsegmentator, or a manifest file of your own"
 
@@ -22,45 +29,65 @@ def cli() -> None:
 
 @cli.group()
 def data() -> None:
-    """List, fetch and verify the files of data_manifest.yaml."""
+    """List, fetch and verify the files of a manifest."""
 
 
-def _dataset_option(function: click.decorators.FC) -> click.decorators.FC:
-    return click.option("--dataset", metavar="D", help="One cohort; all when left out.")(function)
+def _open_dataset(dataset: str | None) -> tuple[Manifest, str | None]:
+    """The manifest and the cohort that ``--dataset`` names: a name in data_manifest.yaml, or a manifest file."""
+    from study.data.manifest import load_manifest
+
+    if dataset is None or not dataset.endswith((".yaml", ".yml")):
+        return load_manifest(), dataset
+    manifest = load_manifest(dataset)
+    if len(manifest.cohorts) != 1:
+        raise StudyError(f"{dataset}: expected one cohort, got {', '.join(manifest.cohorts)}; give each its own file")
+    return manifest, next(iter(manifest.cohorts))
 
 
-@data.command("list")
-@_dataset_option
+def _print_files(table: pd.DataFrame, dataset: str | None) -> None:
+    if table.empty:
+        click.echo(f"{dataset}: no files, it is generated")
+    else:
+        click.echo(table.to_string(index=False, na_rep="-"))
+
+
+@data.command("list", short_help="Print every file and whether it is here.")
+@click.option("--dataset", metavar="D", help="One cohort, or a manifest file; all when left out.")
 def data_list(dataset: str | None) -> None:
     """Print every file: cohort, size, licence, and whether it is here."""
+    from study.cohorts import cohort_of
     from study.data.fetch import data_list as table
-    from study.data.manifest import load_manifest
 
-    click.echo(table(load_manifest(), dataset).to_string(index=False))
+    manifest, name = _open_dataset(dataset)
+    _print_files(table(manifest, name and cohort_of(name)), dataset)
 
 
-@data.command("fetch")
-@click.option("--dataset", default="open", show_default=True, metavar="D", help="The cohort to fetch.")
+@data.command("fetch", short_help="Download what is missing, verified.")
+@click.option("--dataset", default="open", show_default=True, metavar="D", help="The cohort, or a manifest file.")
 def data_fetch(dataset: str) -> None:
     """Download what is missing, verified, into STUDY_DATA_DIR or the platform's cache folder."""
+    from study.cohorts import cohort_of
     from study.data.fetch import fetch_all
-    from study.data.manifest import load_manifest
 
-    for path in fetch_all(load_manifest(), dataset, progress=True).values():
+    manifest, name = _open_dataset(dataset)
+    paths = fetch_all(manifest, name and cohort_of(name), progress=True)
+    for path in paths.values():
         click.echo(path)
+    if not paths:
+        click.echo(f"{dataset}: no files, it is generated")
 
 
-@data.command("verify")
-@_dataset_option
+@data.command("verify", short_help="Check every file against its SHA-256.")
+@click.option("--dataset", metavar="D", help="One cohort, or a manifest file; all when left out.")
 def data_verify(dataset: str | None) -> None:
-    """Check the SHA-256 of every file that is here; exit 1 when one is missing or wrong."""
+    """Check the SHA-256 of every file; exit 1 when one is missing or wrong."""
+    from study.cohorts import cohort_of
     from study.data.fetch import verify_all
-    from study.data.manifest import load_manifest
 
-    table = verify_all(load_manifest(), dataset)
-    click.echo(table.to_string(index=False))
-    if not (table["status"] == "verified").all():
-        sys.exit(1)
+    manifest, name = _open_dataset(dataset)
+    table = verify_all(manifest, name and cohort_of(name))
+    _print_files(table, dataset)
+    click.get_current_context().exit(0 if (table["status"] == "verified").all() else 1)
 
 
 @cli.command()
@@ -73,32 +100,30 @@ def data_verify(dataset: str | None) -> None:
 def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, out: Path | None) -> None:
     """Run every pair of a dataset with every method."""
     from study.batch import run_study
-    from study.data.manifest import load_manifest
     from study.params import find_profile
 
     params = find_profile(profile)
-    if dataset.endswith((".yaml", ".yml")):
-        manifest = load_manifest(dataset)
-        if len(manifest.cohorts) != 1:
-            raise StudyError(f"{dataset}: expected one cohort to run, got {', '.join(manifest.cohorts)}; keep one")
-        dataset = next(iter(manifest.cohorts))
-    else:
-        manifest = load_manifest()
-    folder = out or Path("results") / "runs" / dataset
-    chosen = methods.split(",") if methods else None
-    run_study(
-        dataset, params, folder, methods=chosen, seed=seed, n_jobs=jobs, manifest=manifest, show_progress=True
-    )
+    chosen = None if methods is None else [name.strip() for name in methods.split(",")]
+    manifest, name = _open_dataset(dataset)
+    assert name is not None
+    folder = out or Path("results") / "runs" / name
+    run_study(name, params, folder, methods=chosen, seed=seed, n_jobs=jobs, manifest=manifest, show_progress=True)
     _report(folder)
 
 
 def _report(folder: Path) -> None:
-    from study.results import read_metrics, waypoint_summary
+    """Print what a run wrote: tables, waypoint errors, and the cases that failed with their reasons."""
+    from study.results import FAILED, read_metrics, waypoint_summary
 
+    metrics = read_metrics(folder / "metrics.csv")
     for table in sorted(folder.glob("hd_table*.md")):
         click.echo(f"\n{table.read_text(encoding='utf-8')}")
-    click.echo("Waypoint errors, mm (sec. IV-B; paper: its own volunteer, other data)\n")
-    click.echo(waypoint_summary(read_metrics(folder / "metrics.csv")).round(2).to_string(index=False, na_rep="-"))
+    if metrics["metric"].str.contains("waypoint_error").any():
+        click.echo("Waypoint errors, mm (sec. IV-B; paper: its own volunteer, other data)\n")
+        click.echo(waypoint_summary(metrics).round(2).to_string(index=False, na_rep="-"))
+    failed = metrics[metrics["status"].str.startswith(FAILED)]
+    for (subject, target, reason), cases in failed.groupby(["subject", "target", "status"], sort=False):
+        click.echo(f"{subject} to {target}, {', '.join(cases['method'])}: {reason}")
     click.echo(f"metrics, tables and provenance: {folder}")
 
 
@@ -117,16 +142,19 @@ def report(folder: Path) -> None:
             click.echo(f"{label}: {place}")
 
 
-@cli.command()
+@cli.command(short_help="Check a run against a reference.")
 @click.argument("reference", type=click.Path(path_type=Path))
 @click.argument("candidate", type=click.Path(path_type=Path))
 def compare(reference: Path, candidate: Path) -> None:
-    """Check a run against a reference: exit 0 agrees, 1 differs, 2 no comparison."""
+    """Check a run against a reference.
+
+    Exit code 0: agrees; 1: differs, the largest differences are listed; 2: can't be compared.
+    """
     from study.results import compare as compare_runs
 
     comparison = compare_runs(reference, candidate)
     click.echo(comparison.report())
-    sys.exit(comparison.exit_code)
+    click.get_current_context().exit(comparison.exit_code)
 
 
 @cli.command()
@@ -147,9 +175,11 @@ def register(ct: Path, us: Path, method: str, waypoints: Path | None, seed: int,
     moved = None if path is None else result.transfer(path)
     for line in write_registration(result, moved, out):
         click.echo(line)
+    for warning in [*result.warnings, *([] if result.converged else [f"not converged: {result.stop_reason}"])]:
+        click.echo(f"study: warning: {warning}", err=True)
 
 
-@cli.command()
+@cli.command(short_help="Cartilage cloud of a CT of one's own.")
 @click.argument("ct", type=click.Path(path_type=Path))
 @click.option("--labels", type=click.Path(path_type=Path), help="Label volume on the CT's grid.")
 @click.option("--label-map", default="totalsegmentator_v2", show_default=True, help="Names of the label ids.")
@@ -161,48 +191,44 @@ def cloud(
     ct: Path, labels: Path | None, label_map: str, landmarks: Path | None, points: int, seed: int, out: Path
 ) -> None:
     """Cartilage cloud of a CT of one's own, from labels or landmarks."""
-    from study.cartilage_growth import parts_from_landmarks, parts_from_ribs
-    from study.cohorts import anatomy_of
-    from study.ct import parts_from_labels
-    from study.data.clouds import write_ply
-    from study.data.landmarks import read_landmarks
+    from study.cohorts import read_anatomy
+    from study.data.clouds import as_ply_path, write_ply
     from study.data.manifest import load_manifest
-    from study.data.volumes import read_labels, read_volume
     from study.pipeline import named_rng
 
-    if (labels is None) == (landmarks is None):
-        raise StudyError("expected either --labels or --landmarks, got both or neither")
-    image = read_volume(ct)
-    if landmarks is not None:
-        mask = parts_from_landmarks(image, read_landmarks(landmarks))
-    else:
-        assert labels is not None
-        ids = {name: label for label, name in load_manifest().label_map(label_map).items()}
-        whole = "costal_cartilages" in ids
-        volume = read_labels(labels, image)
-        mask = parts_from_labels(volume, ids) if whole else parts_from_ribs(image, volume, ids)
-    anatomy = anatomy_of(ct.name, image, mask, points, named_rng(seed, f"cloud/{ct.name}"))
+    out = as_ply_path(out)
+    ids = {name: label for label, name in load_manifest().label_map(label_map).items()}
+    rng = named_rng(seed, f"cloud/{ct.name}")
+    anatomy = read_anatomy(ct, points, rng, labels=labels, ids=ids, landmarks=landmarks)
     write_ply(anatomy.cloud, out)
     click.echo(f"{len(anatomy.cloud)} points of sternum and cartilages 2-5, mm RAS+: {out}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; an expected failure is one line on standard error and exit code 2."""
+    chosen = None if arguments is None else list(arguments)
     try:
-        cli.main(args=None if arguments is None else list(arguments), prog_name="study", standalone_mode=False)
+        code = cli.main(args=chosen, prog_name="study", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return 0
     except click.ClickException as error:
-        click.echo(f"study: {error.format_message()} (see `study --help`)", err=True)
+        command = error.ctx.command_path if isinstance(error, click.UsageError) and error.ctx else "study"
+        click.echo(f"study: {' '.join(error.format_message().split())} (see `{command} --help`)", err=True)
         return 2
     except StudyError as error:
         click.echo(f"study: {' '.join(str(error).split())}", err=True)
         return 2
+    except BrokenPipeError:  # whoever read the output has gone: `study data list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        click.echo(f"study: expected a file or folder that can be read and written, got {error}", err=True)
+        return 2
     except (click.Abort, KeyboardInterrupt):
         click.echo("study: stopped", err=True)
         return 130
-    return 0
+    return code or 0
 
 
 if __name__ == "__main__":

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from study import phantom
 from study.cartilage_growth import parts_from_landmarks, parts_from_ribs
 from study.ct import parts_from_labels, sample_cloud, surface
-from study.data.fetch import fetch
+from study.data.fetch import fetch, fetch_all, path_of
 from study.data.landmarks import read_landmarks
-from study.data.manifest import Manifest, Subject, load_manifest
+from study.data.manifest import Cohort, Manifest, Subject, load_manifest
 from study.data.volumes import read_labels, read_masks, read_volume
 from study.deform import planted_deformation
 from study.errors import StudyError
@@ -75,18 +76,36 @@ class Patient:
     report: SweepReport
 
 
+def cohort_of(dataset: str) -> str:
+    """The manifest's cohort that a dataset's files are in: its own, but `open` for ``planted``."""
+    return PLANTED_SOURCE[0] if dataset == "planted" else dataset
+
+
+def origin_of(dataset: str, name: str) -> str | None:
+    """The subject whose known deformation this one is; None for a subject with a CT of its own."""
+    return PLANTED_SOURCE[1] if dataset == "planted" and name in PLANTED_SIZES_MM else None
+
+
 def pairs(dataset: str, params: StudyParams, manifest: Manifest | None = None) -> list[tuple[str, str]]:
     """The (CT, patient) pairs of a dataset.
 
     The phantom has one patient, as the paper; in the open cohorts each subject in turn is the patient of all others.
+    A subject with role ``ct`` is never the patient, one with role ``patient`` never the CT.
 
     Raises:
-        StudyError: no such dataset.
+        StudyError: no such dataset, nobody to pair, or real scans under a name that promises a known truth.
     """
-    if dataset == "planted":
+    manifest = manifest or load_manifest()
+    if dataset == "planted" and dataset not in manifest.cohorts:
         sources, targets = [PLANTED_SOURCE[1]], list(PLANTED_SIZES_MM)
     else:
-        subjects = (manifest or load_manifest()).cohort(dataset).subjects
+        cohort = manifest.cohort(dataset)
+        if dataset == "planted" or (dataset == "phantom" and cohort.kind != "generated"):
+            raise StudyError(
+                f"{manifest.path.name}: expected another name for a cohort of one's own, got {dataset!r}, whose truth "
+                "is known; rename it"
+            )
+        subjects = cohort.subjects
         sources = [name for name, subject in subjects.items() if subject.role in ("ct", "any")]
         targets = [name for name, subject in subjects.items() if subject.role in ("patient", "any")]
     if params.max_targets:
@@ -108,22 +127,19 @@ def load_anatomy(
     Raises:
         StudyError: an unknown name, a failed download, or an image without the anatomy.
     """
+    origin = origin_of(dataset, name)
+    if origin is not None:
+        return plant(load_anatomy(dataset, origin, params, seed, manifest), name)
     rng = named_rng(seed, f"{dataset}/{name}/anatomy")
-    if dataset == "planted" and name in PLANTED_SIZES_MM:
-        return _planted(name, params, seed, manifest)
-    if dataset == "planted":
-        dataset = PLANTED_SOURCE[0]
     manifest = manifest or load_manifest()
-    cohort = manifest.cohort(dataset)
-    if name not in cohort.subjects:
-        raise StudyError(f"expected a subject among {', '.join(cohort.subjects)}, got {name!r}")
+    cohort, subject = _subject(dataset, name, manifest)
     if cohort.kind == "generated":
         drawn = phantom.draw_subject(name, PHANTOM_SEED)
         image, labels = phantom.ct_volume(drawn, params.phantom_spacing_mm, named_rng(PHANTOM_SEED, f"ct/{name}"))
         ids = {structure: label for label, structure in manifest.label_map("totalsegmentator_v2").items()}
         mask = parts_from_labels(labels, ids)
     else:
-        image, mask = _read(manifest, cohort.subjects[name])
+        image, mask = _read(manifest, subject)
     anatomy = anatomy_of(name, image, mask, params.ct_points, rng)
     return replace(anatomy, waypoints=phantom.waypoints(drawn)) if cohort.kind == "generated" else anatomy
 
@@ -133,6 +149,74 @@ def anatomy_of(name: str, image: Volume, mask: Volume, n_points: int, rng: np.ra
     mesh = replace(surface(mask), name=name)
     cloud = replace(sample_cloud(mesh, n_points, rng), name=f"ct:{name}")
     return Anatomy(name, mesh, cloud, intercostal_waypoints(cloud), image, mask)
+
+
+def read_anatomy(
+    ct: Path,
+    n_points: int,
+    rng: np.random.Generator,
+    *,
+    labels: Path | None = None,
+    ids: Mapping[str, int] | None = None,
+    landmarks: Path | None = None,
+) -> Anatomy:
+    """The anatomy of a CT of one's own, from a label volume or a landmark file (sec. II-C.1).
+
+    Args:
+        ct: image file, or folder of a DICOM series.
+        n_points: of the cloud.
+        rng: of the samples.
+        labels: label volume on the CT's grid. Cartilage is taken from it where ``ids`` names it, else grown between
+            the ribs' ends and the sternum.
+        ids: label id of each structure.
+        landmarks: landmark file instead of labels.
+
+    Raises:
+        StudyError: both or neither of labels and landmarks, an unreadable file, or an image without the anatomy.
+    """
+    if (labels is None) == (landmarks is None):
+        raise StudyError(f"expected labels or landmarks, got {'neither' if labels is None else 'both'}; give one")
+    image = read_volume(ct)
+    if labels is None:
+        assert landmarks is not None
+        mask = parts_from_landmarks(image, read_landmarks(landmarks))
+    else:
+        ids = ids or {}
+        volume = read_labels(labels, image)
+        mask = parts_from_labels(volume, ids) if "costal_cartilages" in ids else parts_from_ribs(image, volume, ids)
+    return anatomy_of(image.name, image, mask, n_points, rng)
+
+
+def fetch_subject(dataset: str, name: str, manifest: Manifest, progress: bool = False) -> None:
+    """Fetch and verify the files that a subject's anatomy is read from.
+
+    Raises:
+        StudyError: an unknown name, or a file that cannot be had.
+    """
+    cohort, subject = _subject(dataset, name, manifest)
+    alone = cohort.model_copy(update={"subjects": {name: subject}})
+    fetch_all(manifest.model_copy(update={"cohorts": {name: alone}}), name, progress=progress)
+
+
+def files_of_subject(dataset: str, name: str, manifest: Manifest) -> dict[str, Path]:
+    """The files of a subject that are here, by key; a landmark file under its path in the manifest.
+
+    Raises:
+        StudyError: an unknown name.
+    """
+    _, subject = _subject(dataset, name, manifest)
+    paths = {file.key: path_of(file) for file in manifest.files_of_subject(subject)}
+    landmarks = manifest.landmarks_path(subject)
+    if landmarks is not None:
+        paths[str(subject.landmarks)] = landmarks
+    return {key: path for key, path in paths.items() if path.exists()}
+
+
+def _subject(dataset: str, name: str, manifest: Manifest) -> tuple[Cohort, Subject]:
+    cohort = manifest.cohort(cohort_of(dataset))
+    if name not in cohort.subjects:
+        raise StudyError(f"{dataset}: expected a subject among {', '.join(cohort.subjects)}, got {name!r}")
+    return cohort, cohort.subjects[name]
 
 
 def _read(manifest: Manifest, subject: Subject) -> tuple[Volume, Volume]:
@@ -161,17 +245,16 @@ def _read(manifest: Manifest, subject: Subject) -> tuple[Volume, Volume]:
     return image, mask
 
 
-def _planted(name: str, params: StudyParams, seed: int, manifest: Manifest | None) -> Anatomy:
-    """The source anatomy under a known smooth deformation."""
-    source = load_anatomy(*PLANTED_SOURCE, params, seed, manifest)
-    deform = _plant(source.mesh, name)
+def plant(source: Anatomy, name: str) -> Anatomy:
+    """The patient ``name`` of ``planted``: an anatomy under a known smooth deformation."""
+    deform = _deformation(source.mesh, name)
     mesh = replace(source.mesh, vertices=deform(source.mesh.vertices), name=name)
     cloud = replace(source.cloud, points=deform(source.cloud.points), name=f"ct:{name}")
     waypoints = replace(source.waypoints, points=deform(source.waypoints.points))
     return Anatomy(name, mesh, cloud, waypoints)
 
 
-def _plant(mesh: Mesh, name: str) -> TruthMap:
+def _deformation(mesh: Mesh, name: str) -> TruthMap:
     return planted_deformation(mesh.vertices, PLANTED_SIZES_MM[name], named_rng(0, f"planted/{name}")).apply
 
 
@@ -181,13 +264,11 @@ def truth_map(dataset: str, source: Anatomy, target: str) -> TruthMap | None:
         one, other = (phantom.draw_subject(name, PHANTOM_SEED) for name in (source.name, target))
         return partial(phantom.truth_map, one, other)
     if dataset == "planted":
-        return _plant(source.mesh, target)
+        return _deformation(source.mesh, target)
     return None
 
 
-def make_patient(
-    anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: SweepErrors | None = None
-) -> Patient:
+def make_patient(anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: SweepErrors | None = None) -> Patient:
     """Sweep an anatomy with a virtual tracked probe whose base frame is anywhere (sec. II-C.2).
 
     Args:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from study.errors import StudyError
 
 PHANTOM_SEED = 1  # draws the reported phantom anatomies; their mean distance after a rigid fit lies in 5-10 mm
@@ -34,8 +36,11 @@ class StudyParams:
     radius_mm: float = 20.0
 
     def __post_init__(self) -> None:
-        if self.ct_points < 500 or min(self.us_spacing_mm, self.phantom_spacing_mm, self.radius_mm) <= 0:
+        lengths_mm = (self.us_spacing_mm, self.phantom_spacing_mm, self.radius_mm)
+        if self.ct_points < 500 or not all(0 < length < np.inf for length in lengths_mm):
             raise StudyError(f"expected ct_points >= 500 and positive lengths, got {self}")
+        if min(self.max_sources, self.max_targets) < 0:
+            raise StudyError(f"expected max_sources and max_targets >= 0, 0 for all, got {self}")
 
 
 PROFILES: Mapping[str, StudyParams] = MappingProxyType(
@@ -61,13 +66,22 @@ def override(params: StudyParams, **changes: Any) -> StudyParams:
     """The same parameters with some replaced.
 
     Raises:
-        StudyError: an unknown name.
+        StudyError: an unknown name, or a value of another type or out of range.
     """
     known = {entry.name for entry in fields(params)}
     unknown = sorted(set(changes) - known)
     if unknown:
         raise StudyError(f"expected parameters among {', '.join(sorted(known))}, got {', '.join(unknown)}")
+    for name, value in changes.items():
+        _check_type(name, value, type(getattr(params, name)))
     return replace(params, **changes)
+
+
+def _check_type(name: str, value: Any, kind: type) -> None:
+    """A bool is no number here, though Python says so; a whole number is one with a fraction."""
+    fits = isinstance(value, kind) or (kind is float and isinstance(value, int))
+    if not fits or (isinstance(value, bool) and kind is not bool):
+        raise StudyError(f"parameter {name}: expected {kind.__name__}, got {value!r} ({type(value).__name__})")
 
 
 def check_parameters(namespace: Mapping[str, Any], **allowed: type) -> None:
@@ -93,6 +107,4 @@ def check_parameters(namespace: Mapping[str, Any], **allowed: type) -> None:
     if unknown:
         raise StudyError(f"expected parameters among {', '.join(allowed)}, got unknown {', '.join(unknown)}")
     for name, kind in allowed.items():
-        value = given.get(name)
-        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise StudyError(f"parameter {name}: expected {kind.__name__}, got {value!r} ({type(value).__name__})")
+        _check_type(name, given.get(name), kind)
