@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from study.cartilage_growth import landmarks_from_ribs, parts_from_landmarks, parts_from_ribs, rib_ends
+from study.cartilage_growth import parts_from_landmarks, parts_from_ribs, rib_ends
 from study.chest_wall import anterior_wall_image
 from study.ct import LABEL_MAPS, rib_name
 from study.data.landmarks import Landmarks, read_landmarks
@@ -107,13 +107,11 @@ def test_landmarks_alone_find_every_part(drawn: tuple[Volume, Volume, np.ndarray
     assert min(scores.values()) > 0.8, scores
 
 
-def test_rib_ends_and_attachments_are_where_they_were_drawn(drawn: tuple[Volume, Volume, np.ndarray]) -> None:
-    ct, labels, _ = drawn
-    found = landmarks_from_ribs(ct, labels, IDS)
-    ends = rib_ends(labels, IDS)
+def test_rib_ends_are_where_they_were_drawn(drawn: tuple[Volume, Volume, np.ndarray]) -> None:
+    ends = rib_ends(drawn[1], IDS)
+    assert set(ends) == set(CARTILAGES)
     for part in CARTILAGES:
         assert np.linalg.norm(ends[part] - junction(part)) < 5.0  # the tube's round cap
-        assert np.linalg.norm(found.attachments[part] - attachment(part)) < 8.0  # anywhere on the joint, 11 mm high
 
 
 def test_images_and_landmarks_that_do_not_fit_are_refused(

@@ -279,8 +279,8 @@ def _check_in_tissue(image: Volume, landmarks: Landmarks) -> None:
             density = ndimage.map_coordinates(smooth, image.to_index(point)[:, None], order=1, mode="nearest")[0]
             if density < 0.0:
                 raise StudyError(
-                    f"{image.name}: expected cartilage or bone at the {what} of {part.name.lower()}, got "
-                    f"{density:.0f} HU at {np.round(point, 1).tolist()} mm (fat or lung); check the landmark, its frame and the orientation"
+                    f"{image.name}: expected cartilage or bone at the {what} of {part.name.lower()}, got {density:.0f} "
+                    f"HU at {np.round(point, 1).tolist()} mm (fat or lung); check the landmark and the orientation"
                 )
 
 
