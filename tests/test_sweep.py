@@ -18,6 +18,7 @@ from study.sweep import (
     SweepErrors,
     error_budget,
     error_table,
+    simulate_calibration_views,
     simulate_latency_run,
     simulate_sweep,
     surface_distance_mm,
@@ -26,7 +27,7 @@ from study.sweep import (
     visible_surface,
 )
 from study.types import Mesh, Part, RigidTransform, TrackedSweep
-from study.us import calibrate_latency, contour_points, sweep_cloud
+from study.us import calibrate_latency, calibrate_spatial, contour_points, sweep_cloud
 
 FRONT = (0.0, 1.0, 0.0)
 
@@ -317,6 +318,15 @@ def test_a_mesh_inside_out_is_refused(chest):
 def test_the_simulated_calibration_run_gives_its_latency_back():
     found = calibrate_latency(*simulate_latency_run(LATENCY_S, np.random.default_rng(0)))
     assert abs(found.latency_s - LATENCY_S) < 0.005
+
+
+def test_the_simulated_calibration_views_give_the_place_of_the_image_back():
+    probe = Probe()
+    found = calibrate_spatial(*simulate_calibration_views(np.random.default_rng(0), probe=probe))
+    off = found.T_probe_image @ probe.T_probe_image.inverse
+    assert np.linalg.norm(found.T_probe_image.translation - probe.T_probe_image.translation) < 0.3
+    assert off.angle_deg < 0.3
+    np.testing.assert_allclose(found.pixel_spacing_mm, probe.pixel_mm, rtol=0.005)
 
 
 def test_2000_frames_become_a_cloud_in_10_s(chest):

@@ -557,3 +557,28 @@ def simulate_latency_run(
     taken = np.sort(taken + rng.uniform(-0.01, 0.01, len(taken)))
     depths = (20.0 + height(taken)) / probe.pixel_mm + noise_px * rng.normal(size=len(taken))
     return depths, taken + latency_s, height(robot_times), robot_times
+
+
+def simulate_calibration_views(
+    rng: np.random.Generator,
+    *,
+    n_views: int = 60,
+    tilt_deg: float = 40.0,
+    noise_px: float = 0.5,
+    probe: Probe | None = None,
+) -> tuple[Floats, Floats]:
+    """The recording that spatial calibration needs: one fixed point all over the image, the probe tilted and turned.
+
+    Returns:
+        pixels (n, 2), column and row of the point in each view; poses (n, 4, 4) ``T_base_probe``, mm.
+    """
+    probe = probe or Probe()
+    rows, columns = probe.shape
+    pixels = rng.uniform([0.0, 0.1 * rows], [columns - 1.0, rows - 1.0], (n_views, 2))
+    angles = rng.uniform(-tilt_deg, tilt_deg, (n_views, 3)) * [1.0, 1.0, 3.0] + [180.0, 0.0, 0.0]
+    rotation = Rotation.from_euler("xyz", angles, degrees=True)
+    seen = probe.T_probe_image.apply(np.column_stack([pixels * probe.pixel_mm, np.zeros(n_views)]))
+    poses = np.tile(np.eye(4), (n_views, 1, 1))
+    poses[:, :3, :3] = rotation.as_matrix()
+    poses[:, :3, 3] = np.array([500.0, -200.0, 80.0]) - rotation.apply(seen)
+    return pixels + noise_px * rng.normal(size=pixels.shape), poses

@@ -4,6 +4,7 @@ Nothing here runs a method or touches a disk; a notebook shows a figure that a c
 """
 
 from study.figures.anatomy import anatomy_overview, ct_slice, mesh_and_cloud
+from study.figures.clouds import cloud_errors, pose_gallery
 from study.figures.registration import (
     CoarseView,
     coarse_overlay,
@@ -38,6 +39,7 @@ __all__ = [
     "MethodStyle",
     "StudyFigure",
     "anatomy_overview",
+    "cloud_errors",
     "coarse_overlay",
     "coarse_steps",
     "ct_slice",
@@ -51,6 +53,7 @@ __all__ = [
     "method_style",
     "one_way",
     "png",
+    "pose_gallery",
     "registration_grid",
     "sensitivity",
     "skeleton_graph",
