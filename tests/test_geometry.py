@@ -100,6 +100,17 @@ def test_principal_axes_are_right_handed_and_fall_in_spread():
     assert np.abs(np.sum(axes * motion.rotation.T, axis=1)) == pytest.approx(np.ones(3), abs=1e-3)
 
 
+def test_a_moved_cloud_has_the_moved_principal_axes():
+    rng = np.random.default_rng(8)
+    points = rng.gamma(2.0, size=(500, 3)) * [30.0, 10.0, 2.0]
+    centre, axes = principal_axes(points)
+    for _ in range(20):
+        motion = RigidTransform.random(rng)
+        moved_centre, moved_axes = principal_axes(motion.apply(points))
+        assert moved_axes == pytest.approx(axes @ motion.rotation.T, abs=1e-9)
+        assert moved_centre == pytest.approx(motion.apply(centre[None])[0], abs=1e-9)
+
+
 def test_every_point_lies_in_its_pixel():
     points = np.random.default_rng(5).uniform(-37, 55, (300, 2))
     image, pixels, origin = pixelise(points, 3.0, pad=2)

@@ -42,7 +42,7 @@ def test_an_empty_sphere_is_an_error_that_names_the_waypoint():
     with pytest.raises(StudyError, match=r"waypoint 2: expected at least 3 CT points .* within 20 mm, got 0; check"):
         transfer_path(WALL, WALL, waypoints)
     two = np.vstack([WALL[:1], WALL[:1] + 1.0])
-    with pytest.raises(StudyError, match="waypoint 0: expected at least 3 CT points .* got 2"):
+    with pytest.raises(StudyError, match=r"waypoint 0: expected at least 3 CT points .* got 2"):
         transfer_path(two, two, two[:1])
 
 
@@ -65,7 +65,7 @@ def test_waypoints_are_checked():
 
 
 def test_clouds_that_do_not_pair_are_refused():
-    with pytest.raises(StudyError, match=r"expected one warped point per source point, got \(2000, 3\) and \(1999, 3\)"):
+    with pytest.raises(StudyError, match=r"expected one warped point per source point, got \(2000, 3\) and"):
         transfer_path(WALL, WALL[:-1], WAYPOINTS)
     with pytest.raises(StudyError, match="warped: expected finite numbers, got 1 rows"):
         transfer_path(WALL, np.where(np.arange(2000)[:, None] == 5, np.nan, WALL), WAYPOINTS)
@@ -76,5 +76,5 @@ def test_a_registration_offers_the_verb():
     result = Registration(WALL, motion.apply(WALL), motion, True, 1, "planted")
     assert result.transfer(WAYPOINTS.tolist()) == pytest.approx(motion.apply(WAYPOINTS), abs=1e-9)
     assert result.transfer(WAYPOINTS, radius_mm=30) == pytest.approx(motion.apply(WAYPOINTS), abs=1e-9)
-    with pytest.raises(StudyError, match="within 0.1 mm"):
+    with pytest.raises(StudyError, match=r"within 0\.1 mm"):
         result.transfer(WAYPOINTS, radius_mm=0.1)

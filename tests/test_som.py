@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracles_som import som_literal
 
+from study.coarse import chest_frame
 from study.errors import StudyError
 from study.som import SomParams, fit_som, neighbourhood, quantisation_error_mm
 from study.template import template_graph
@@ -16,8 +17,6 @@ SHORT = SomParams(epochs=4, samples=25, radius=5.0)
 
 @pytest.fixture(scope="module")
 def start(ct_clouds):
-    from study.coarse import chest_frame
-
     return template_graph(chest_frame(ct_clouds["ct1"])), ct_clouds["ct1"]
 
 
@@ -136,7 +135,8 @@ def test_the_same_seed_gives_the_same_bytes_and_nothing_is_written_to(start):
 
 def test_own_part_winners_never_leave_their_part(start):
     graph, cloud = start
-    only_sternum = PointCloud(cloud.only(Part.STERNUM) + [400.0, 0, 0], parts=np.zeros(len(cloud.only(Part.STERNUM))))
+    shifted = cloud.only(Part.STERNUM) + np.array([400.0, 0, 0])
+    only_sternum = PointCloud(shifted, parts=np.zeros(len(shifted), dtype=np.int64))
     params = replace(SHORT, winners="own_part", radius=1.0)
     moved = fit_som(graph, only_sternum, params, np.random.default_rng(0))[0].nodes - graph.nodes
     # All points lie beyond the right branches, whose nodes would win; of its own part the sternum's edge does.

@@ -1,6 +1,7 @@
 """The template is the authors' grid: counted, placed and linked as sec. III-B says."""
 
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -65,7 +66,7 @@ def test_branches_leave_the_sternum_from_its_edge_with_gaps_of_3_2_1_rows(chest)
         assert all(len(three) == 3 and three == list(range(three[0], three[0] + 3)) for three in rows)
         assert rows[0][0] == 0
         assert rows[-1][-1] == 17
-        assert [lower[0] - upper[-1] - 1 for upper, lower in zip(rows, rows[1:], strict=False)] == [3, 2, 1]
+        assert [lower[0] - upper[-1] - 1 for upper, lower in pairwise(rows)] == [3, 2, 1]
     assert np.array_equal(np.array(list(attached.values()))[:4], np.array(list(attached.values()))[4:])
 
 
@@ -97,7 +98,7 @@ def test_upper_rows_reach_lower_ones_only_by_way_of_the_sternum(chest):
     graph = template_graph(chest)
     directed, undirected = graph.hops(directed=True), graph.hops(directed=False)
     for part in (Part.LEFT_4, Part.RIGHT_5):
-        for upper_row, lower_row in zip(rows_of(graph, part), rows_of(graph, part)[1:], strict=False):
+        for upper_row, lower_row in pairwise(rows_of(graph, part)):
             for column, (upper, lower) in enumerate(zip(upper_row, lower_row, strict=True)):
                 assert directed[lower, upper] == 1
                 assert directed[upper, lower] == 2 * (column + 1) + 1  # in, one row down, out

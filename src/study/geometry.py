@@ -58,10 +58,14 @@ def nearest(queries: Floats, cloud: Floats) -> tuple[Floats, Ints]:
 
 
 def principal_axes(points: Floats) -> tuple[Floats, Floats]:
-    """Centroid (3,) and right-handed principal axes (3, 3), rows by falling variance (sec. III-A.1)."""
+    """Centroid (3,) and right-handed principal axes (3, 3), rows by falling variance (sec. III-A.1).
+
+    The first two point to the longer tail of the points, so that a moved cloud has the moved axes.
+    """
     centre = points.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((points - centre).T))
     axes = axes[:, ::-1].T
+    axes[(((points - centre) @ axes.T) ** 3).sum(axis=0) < 0] *= -1
     axes[2] = np.cross(axes[0], axes[1])
     return centre, axes
 
@@ -89,7 +93,7 @@ def close_gaps(image: Bools, pixels: int) -> Bools:
     """Fill holes up to ``2 * pixels`` wide, such as those between the samples of a sparse cloud."""
     if pixels < 1:
         return image
-    disc = np.hypot(*np.mgrid[-pixels : pixels + 1, -pixels : pixels + 1]) <= pixels + 0.5
+    disc = np.hypot(*np.mgrid[-pixels : pixels + 1, -pixels : pixels + 1]) <= pixels
     return binary_closing(np.pad(image, pixels), disc)[pixels:-pixels, pixels:-pixels]
 
 
