@@ -24,6 +24,7 @@ KERNEL = "python3"
 
 
 def sources() -> list[Path]:
+    """The percent notebooks, in order."""
     found = sorted(NOTEBOOKS.glob("[0-9]*.py"))
     if not found:
         raise SystemExit(f"expected notebooks in {NOTEBOOKS}, got none")
@@ -34,9 +35,7 @@ def code(path: Path) -> list[str]:
     """Code cells without papermill's injected one."""
     cells = jupytext.read(path).cells
     injected = "injected-parameters"
-    return [
-        c.source.strip() for c in cells if c.cell_type == "code" and injected not in c.metadata.get("tags", [])
-    ]
+    return [c.source.strip() for c in cells if c.cell_type == "code" and injected not in c.metadata.get("tags", [])]
 
 
 def execute(source: Path, target: Path, parameters: dict[str, Any]) -> None:
@@ -77,6 +76,7 @@ def tidy(notebook: Any) -> None:
 
 
 def main() -> int:
+    """Do what the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     run = verbs.add_parser("run", help="execute into a folder")
@@ -90,6 +90,7 @@ def main() -> int:
     if chosen.verb == "check":
         return check()
     os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
+    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # else its banner is the first output
     todo = [s for s in sources() if not chosen.names or any(s.stem.startswith(name) for name in chosen.names)]
     for number, source in enumerate(todo, 1):
         print(f"notebook {number} of {len(todo)}: {source.stem}", flush=True)
@@ -99,7 +100,12 @@ def main() -> int:
 
 
 def check() -> int:
-    faults = []
+    """Print what is wrong with the pairs; 1 if anything is."""
+    faults = [
+        f"{paired.name}: expected {paired.stem}.py beside it, got none; remove it"
+        for paired in sorted(NOTEBOOKS.glob("[0-9]*.ipynb"))
+        if not paired.with_suffix(".py").is_file()
+    ]
     for source in sources():
         paired = source.with_suffix(".ipynb")
         if not paired.is_file():

@@ -114,6 +114,7 @@ def _styles(name: str, label: str, colour: str, marker: str) -> dict[str, Method
 
 
 METHOD_STYLE: Mapping[str, MethodStyle] = {  # Paul Tol's vibrant scheme, safe for the colour-blind
+    "coarse": MethodStyle("Coarse alignment", "#777777", "v", tuned=False),
     **_styles("icp", "ICP", "#0077BB", "o"),
     **_styles("nonrigid_icp", "Non-rigid ICP", "#EE7733", "s"),
     **_styles("cpd", "CPD", "#009988", "^"),
