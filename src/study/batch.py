@@ -43,7 +43,9 @@ from study.results import (
     failed_row,
     metric_rows,
     provenance,
+    read_metrics,
     sha256_of,
+    why_stale,
     write_hd_table,
     write_json,
     write_metrics,
@@ -313,13 +315,36 @@ def run_study(
     )
     write_metrics(rows, out / "metrics.csv")
     write_timings(timings, out / "timings.csv")
-    parameters = {"study": asdict(params), "methods": {name: asdict(METHODS[name]) for name in chosen}}
+    parameters = run_parameters(params, chosen)
     inputs = _input_hashes(dataset, {name for row in rows for name in (row["subject"], row["target"])}, manifest)
     write_json(provenance(parameters, seed, inputs, started, datetime.now(UTC)), out / "provenance.json")
     write_tables(pd.DataFrame(rows), out)
     if all(row["status"].startswith(FAILED) for row in rows):
         reasons = sorted({row["status"].removeprefix(FAILED) for row in rows})
         raise StudyError(f"{dataset}: every case failed: {' | '.join(reasons)}")
+
+
+def run_parameters(params: StudyParams, methods: Iterable[str] | None = None) -> dict[str, Any]:
+    """Every parameter of a run, for its provenance."""
+    return {"study": asdict(params), "methods": {name: asdict(METHODS[name]) for name in _chosen(methods)}}
+
+
+def load_or_run(
+    dataset: str, params: StudyParams, folder: Path, *, seed: int = 0, n_jobs: int = 1, show_progress: bool = False
+) -> tuple[pd.DataFrame, str]:
+    """The metrics of a dataset: those in ``folder`` if the code and parameters of now made them, else of a new run.
+
+    Returns:
+        rows as `read_metrics` gives them, and a sentence that says where they are from.
+
+    Raises:
+        StudyError: as `run_study`.
+    """
+    reason = why_stale(folder, run_parameters(params), seed)
+    if reason is not None:
+        run_study(dataset, params, folder, seed=seed, n_jobs=n_jobs, show_progress=show_progress)
+    metrics = read_metrics(folder / "metrics.csv")
+    return metrics, "loaded: code, parameters and seed are those of now" if reason is None else f"run now: {reason}"
 
 
 def _input_hashes(dataset: str, names: Iterable[str], manifest: Manifest) -> dict[str, str]:
