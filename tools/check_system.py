@@ -28,6 +28,7 @@ def missing() -> list[str]:
 
 
 def main() -> int:
+    """Name what is missing and the command that installs it; 2 if anything is."""
     if sys.platform != "linux":
         return 0
     absent = missing()

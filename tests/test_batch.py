@@ -1,0 +1,227 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from phantom_files import SMALL, cached_ct_volume
+
+from study import batch, phantom
+from study.batch import Outcome, Workers, run_dataset, run_study, write_tables
+from study.cohorts import Anatomy, load_anatomy
+from study.errors import StudyError
+from study.results import FAILED, failed_row, metric_rows, read_metrics
+
+METHODS = ("coarse", "icp")
+TWO_CTS = replace(SMALL, max_sources=2)
+
+
+@pytest.fixture(autouse=True)
+def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(phantom, "ct_volume", cached_ct_volume)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with one worker."""
+    out = tmp_path_factory.mktemp("runs") / "first"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(phantom, "ct_volume", cached_ct_volume)
+        run_study("phantom", SMALL, out, methods=METHODS)
+    return out
+
+
+# --- what must not change a byte -------------------------------------------------------------------------------------
+
+
+def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) -> None:
+    run_study("phantom", SMALL, tmp_path, methods=reversed(METHODS), n_jobs=2)
+    metrics = read_metrics(first / "metrics.csv")
+    assert len(metrics) == 2 * (3 + 3 + 4 * 20)  # methods x (distances, true errors, four kinds of 20 waypoints)
+    assert set(metrics["status"]) <= {"ok", "not converged"}
+    assert (tmp_path / "metrics.csv").read_bytes() == (first / "metrics.csv").read_bytes()
+    assert (tmp_path / "hd_table.md").read_bytes() == (first / "hd_table.md").read_bytes()
+
+
+def test_one_method_alone_has_the_rows_it_has_among_others(first: Path) -> None:
+    rows, _ = run_dataset("phantom", SMALL, methods=["icp", "icp"])
+    among = read_metrics(first / "metrics.csv").query("method == 'icp'")
+    alone = pd.DataFrame(rows).sort_values(["metric", "index"])
+    assert len(alone) == len(among)
+    assert alone["value"].to_list() == among.sort_values(["metric", "index"])["value"].to_list()
+
+
+def test_another_seed_gives_other_numbers(first: Path) -> None:
+    rows, _ = run_dataset("phantom", SMALL, methods=["coarse"], seed=1)
+    before = read_metrics(first / "metrics.csv").query("method == 'coarse' and metric == 'hd'")["value"].item()
+    after = next(row["value"] for row in rows if row["metric"] == "hd")
+    assert after != before
+    assert after == pytest.approx(before, rel=0.5)  # another sweep of the same people
+
+
+def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
+    assert {path.name for path in first.iterdir()} == {
+        "metrics.csv", "timings.csv", "provenance.json", "hd_table.csv", "hd_table.md", "hd_table.tex"
+    }  # fmt: skip
+    assert " n " in (first / "hd_table.md").read_text()
+    timings = pd.read_csv(first / "timings.csv")
+    assert timings["stage"].value_counts().to_dict() == {
+        "anatomy": 2, "sweep": 1, "coarse ct": 1, "coarse us": 1, "register": 2
+    }  # fmt: skip
+    provenance = json.loads((first / "provenance.json").read_text())
+    assert provenance["parameters"]["study"]["ct_points"] == SMALL.ct_points
+    assert sorted(provenance["parameters"]["methods"]) == list(METHODS)
+    assert list(provenance["inputs_sha256"]) == ["data_manifest.yaml"]
+
+
+# --- what fails ------------------------------------------------------------------------------------------------------
+
+
+Load = Callable[..., Anatomy]
+
+
+def failing(who: str, error: Exception) -> Load:
+    def load(dataset: str, name: str, *rest: Any) -> Anatomy:
+        if name == who:
+            raise error
+        return load_anatomy(dataset, name, *rest)
+
+    return load
+
+
+def test_a_subject_that_fails_is_rows_with_the_reason_and_the_rest_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch, "load_anatomy", failing("ct2", StudyError("ct2: expected ribs,\n got a fish")))
+    run_study("phantom", TWO_CTS, tmp_path, methods=METHODS)
+    metrics = read_metrics(tmp_path / "metrics.csv")
+    failed = metrics[metrics["subject"] == "ct2"]
+    assert failed["method"].to_list() == list(METHODS)
+    assert set(failed["status"]) == {FAILED + "ct2: expected ribs, got a fish"}
+    assert not metrics[metrics["subject"] == "ct1"]["status"].str.startswith(FAILED).any()
+    table = pd.read_csv(tmp_path / "hd_table.csv")
+    ours = table[table["data"] == "this study"].set_index("method")
+    assert ours["n"].to_list() == [1, 1]
+    assert ours["n_failed"].to_list() == [1, 1]
+    assert "1 failed" in (tmp_path / "hd_table.md").read_text()
+
+
+def test_a_patient_that_fails_takes_every_case_with_it_and_that_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch, "load_anatomy", failing("patient", StudyError("patient: expected ribs, got a fish")))
+    with pytest.raises(StudyError, match=r"phantom: every case failed: patient: expected ribs, got a fish$"):
+        run_study("phantom", SMALL, tmp_path, methods=METHODS)
+    metrics = read_metrics(tmp_path / "metrics.csv")
+    assert len(metrics) == 2
+    assert metrics["status"].str.endswith("got a fish").all()
+
+
+def test_a_method_that_fails_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = batch.register_aligned
+
+    def register(alignment: Any, method: Any, rng: Any) -> Any:
+        if method.name == "icp":
+            raise StudyError("icp: expected overlap, got none")
+        return whole(alignment, method, rng)
+
+    monkeypatch.setattr(batch, "register_aligned", register)
+    rows, timings = run_dataset("phantom", SMALL, methods=METHODS)
+    assert {row["method"] for row in rows if row["status"].startswith(FAILED)} == {"icp"}
+    assert sum(row["method"] == "coarse" and row["status"] == "ok" for row in rows) > 80
+    assert [row["method"] for row in timings if row["stage"] == "register"] == ["coarse"]
+
+
+def test_a_bug_is_no_failed_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "load_anatomy", failing("ct1", ZeroDivisionError("oops")))
+    with pytest.raises(ZeroDivisionError):
+        run_dataset("phantom", SMALL, methods=["coarse"])
+
+
+def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "load_anatomy", failing("ct1", AssertionError("nothing may be read")))
+    with pytest.raises(StudyError, match=r"among coarse, icp, .*got 'ipc'"):
+        run_study("phantom", SMALL, tmp_path / "a", methods=["ipc"])
+    with pytest.raises(StudyError, match="got none"):
+        run_study("phantom", SMALL, tmp_path / "a", methods=[])
+    with pytest.raises(StudyError, match="got 'phantom2'"):
+        run_study("phantom2", SMALL, tmp_path / "a", methods=["coarse"])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        run_study("phantom", SMALL, tmp_path / "file" / "out", methods=["coarse"])
+
+
+# --- the planted deformations ----------------------------------------------------------------------------------------
+
+
+def test_the_planted_source_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    read = []
+
+    def load(dataset: str, name: str, *rest: Any) -> Anatomy:
+        read.append((dataset, name))
+        return replace(load_anatomy("phantom", "ct1", *rest), name=name)
+
+    monkeypatch.setattr(batch, "load_anatomy", load)
+    monkeypatch.setattr(batch, "fetch_subject", lambda *_: None)
+    rows, timings = run_dataset("planted", replace(SMALL, max_targets=3), methods=["coarse"])
+    assert read == [("planted", "lidc-0001")]
+    assert {row["target"] for row in rows} == {"planted1", "planted2", "planted3"}
+    done = [row for row in rows if row["target"] == "planted1"]
+    assert {row["status"] for row in done} == {"ok"}
+    assert {row["metric"] for row in done} >= {"true_error_mean", "true_waypoint_error"}
+    assert sum(row["stage"] == "anatomy" for row in timings) == 4
+
+
+# --- workers and tables ----------------------------------------------------------------------------------------------
+
+
+def half(number: int) -> float:
+    if number % 2:
+        raise StudyError(f"expected an even number, got {number}")
+    return number / 2
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_outcomes_keep_their_keys_and_failures_are_passed_on(n_jobs: int) -> None:
+    workers = Workers(n_jobs, show_progress=False)
+    halves = workers.run("halves", {n: (half, n) for n in (8, 3, 4)})
+    quarters = workers.run("quarters", {n: (half, value) for n, value in halves.items()})
+    assert [(n, outcome.value) for n, outcome in quarters.items()] == [(8, 2.0), (3, None), (4, 1.0)]
+    with pytest.raises(StudyError, match="got 3"):
+        quarters[3].get()
+    assert workers.run("nothing", {}) == {}
+    assert Outcome(5).get() == 5
+
+
+def test_progress_says_which_of_how_many_and_the_time_left(capsys: pytest.CaptureFixture[str]) -> None:
+    Workers(1, show_progress=True).run("phantom: registrations", {n: (half, n) for n in (2, 4)})
+    shown = capsys.readouterr().err
+    assert "phantom: registrations: 2 of 2" in shown
+    assert "left" in shown
+
+
+def rows_of(cases: list[tuple[str, str]]) -> pd.DataFrame:
+    rows = [row for source, target in cases for row in metric_rows("d", source, target, "icp", 0, {"hd": 9.0})]
+    return pd.DataFrame(rows)
+
+
+def test_one_patient_gives_one_table_and_more_give_one_each_and_all_pairs(tmp_path: Path) -> None:
+    write_tables(rows_of([("a", "b"), ("b", "a"), ("c", "a")]), tmp_path)
+    assert {path.stem for path in tmp_path.glob("*.md")} == {"hd_table_a", "hd_table_b", "hd_all_pairs"}
+    write_tables(rows_of([("a", "p"), ("b", "p")]), tmp_path)  # the former run's are gone
+    assert {path.stem for path in tmp_path.glob("*.md")} == {"hd_table"}
+
+
+def test_one_ct_with_several_patients_has_them_as_columns(tmp_path: Path) -> None:
+    write_tables(rows_of([("a", "p1"), ("a", "p2")]), tmp_path)
+    assert [path.stem for path in tmp_path.glob("*.md")] == ["hd_table"]
+    assert {"p1", "p2"} <= set(pd.read_csv(tmp_path / "hd_table.csv").columns)
+
+
+def test_a_table_of_failures_only_can_be_written(tmp_path: Path) -> None:
+    write_tables(pd.DataFrame([failed_row("d", s, "p", "icp", 0, "no sternum") for s in "ab"]), tmp_path)
+    assert "2 failed" in (tmp_path / "hd_table.md").read_text()

@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import jupytext
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"tools_{name}", ROOT / "tools" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+# --- check_system.py -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def system(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = load("check_system")
+    monkeypatch.setattr(module.sys, "platform", "linux")
+    return module
+
+
+def without(module: ModuleType, monkeypatch: pytest.MonkeyPatch, absent: set[str], tool: str | None) -> None:
+    def cdll(name: str) -> None:
+        if name in absent:
+            raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(module.ctypes, "CDLL", cdll)
+    monkeypatch.setattr(module.shutil, "which", lambda name: f"/usr/bin/{name}" if name == tool else None)
+
+
+@pytest.mark.parametrize(
+    ("tool", "command"),
+    [("apt-get", "sudo apt-get install -y libgl1 libgomp1"), ("dnf", "sudo dnf install -y mesa-libGL libgomp"),
+     ("pacman", "sudo pacman -S libglvnd gcc-libs"), (None, "sudo apt-get install -y libgl1 libgomp1")],
+)  # fmt: skip
+def test_missing_libraries_are_one_line_with_the_command(
+    system: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tool: str, command: str
+) -> None:
+    without(system, monkeypatch, {"libGL.so.1", "libgomp.so.1"}, tool)
+    assert system.main() == 2
+    out, err = capsys.readouterr()
+    assert err == f"setup: missing system libraries libGL.so.1, libgomp.so.1; run: {command}\n"
+    assert out == ""
+
+
+def test_a_complete_machine_and_other_systems_pass_in_silence(
+    system: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    without(system, monkeypatch, set(), "apt-get")
+    assert system.main() == 0
+    without(system, monkeypatch, set(system.NEEDED), "apt-get")
+    monkeypatch.setattr(system.sys, "platform", "darwin")
+    assert system.main() == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_check_runs_on_a_bare_python() -> None:
+    done = subprocess.run(
+        [sys.executable, "-S", "-I", str(ROOT / "tools" / "check_system.py")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode in (0, 2)
+    assert "Traceback" not in done.stderr
+
+
+# --- notebooks.py ----------------------------------------------------------------------------------------------------
+
+SOURCE = '# %% [markdown]\n# # What is one and one?\n\n# %% tags=["parameters"]\na = 1\n\n# %%\nprint(a + 1)\n'
+
+
+@pytest.fixture
+def notebooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The tool, looking at one source and its executed pair."""
+    module = load("notebooks")
+    monkeypatch.setattr(module, "NOTEBOOKS", tmp_path)
+    (tmp_path / "00_sum.py").write_text(SOURCE)
+    notebook = jupytext.reads(SOURCE, fmt="py:percent")
+    notebook.cells[-1].outputs = [nbformat.v4.new_output("stream", name="stdout", text="2\n")]
+    nbformat.write(notebook, tmp_path / "00_sum.ipynb")
+    return module
+
+
+def test_a_pair_that_agrees_passes(notebooks: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    assert notebooks.check() == 0
+    assert capsys.readouterr().out == "1 notebook pairs agree\n"
+
+
+def test_papermills_own_cell_is_no_difference(notebooks: ModuleType) -> None:
+    path = notebooks.NOTEBOOKS / "00_sum.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    cell = nbformat.v4.new_code_cell("a = 3", metadata={"tags": ["injected-parameters"]})
+    notebook.cells.insert(2, cell)
+    nbformat.write(notebook, path)
+    assert notebooks.check() == 0
+
+
+@pytest.mark.parametrize("fault", ["code", "outputs", "size", "absent", "orphan"])
+def test_each_fault_fails_and_names_its_notebook(
+    notebooks: ModuleType, capsys: pytest.CaptureFixture[str], fault: str
+) -> None:
+    folder = notebooks.NOTEBOOKS
+    path = folder / "00_sum.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    if fault == "code":
+        (folder / "00_sum.py").write_text(SOURCE.replace("a + 1", "a + 2"))
+    elif fault == "outputs":
+        notebook.cells[-1].outputs = []
+        nbformat.write(notebook, path)
+    elif fault == "size":
+        notebook.cells[-1].outputs[0].text = "2" * notebooks.MAX_BYTES
+        nbformat.write(notebook, path)
+    elif fault == "absent":
+        path.unlink()
+    else:
+        nbformat.write(notebook, folder / "01_left_over.ipynb")
+    assert notebooks.check() == 1
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 1
+    named = {"absent": "00_sum.py", "orphan": "01_left_over.ipynb"}.get(fault, "00_sum.ipynb")
+    assert said[0].startswith(f"{named}: ")
+
+
+def test_no_notebooks_at_all_is_a_failure_not_a_pass(notebooks: ModuleType) -> None:
+    (notebooks.NOTEBOOKS / "00_sum.py").unlink()
+    with pytest.raises(SystemExit, match="got none"):
+        notebooks.check()
+
+
+def test_unknown_parameters_are_refused_before_anything_runs(notebooks: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"00_sum\.py: expected parameters among a, got b"):
+        notebooks.execute(tmp_path / "00_sum.py", tmp_path / "out.ipynb", {"b": 2})
+    assert not (tmp_path / "out.ipynb").exists()
