@@ -36,6 +36,12 @@ class SkeletonGraphMethod:
     blend_k: int = 3
     blend_weights: BlendWeights = "distance"
 
+    @classmethod
+    def tuned(cls) -> SkeletonGraphMethod:
+        """The best row of ``results/tuning/skeleton_graph.csv``, found on development subjects."""
+        som = SomParams(rate_schedule="linear", winners="own_part")
+        return cls(som, som, n_reg=2, neighbours="hops", blend_weights="inverse_distance")
+
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Register labelled, coarsely aligned clouds.
 

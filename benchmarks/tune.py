@@ -1,6 +1,6 @@
-"""Tune the baselines on development subjects: every grid row on every case, one table a method.
+"""Tune every method on development subjects: every grid row on every case, one table a method.
 
-    python benchmarks/tune_baselines.py [icp nonrigid_icp cpd] [--out results/tuning]
+    python benchmarks/tune.py [icp nonrigid_icp cpd skeleton_graph visible_surface] [--out results/tuning]
 
 The development subjects are phantoms of cohort seeds that the study does not report. Each pair starts from the coarse
 alignment, as in the study. The best row has the smallest mean true waypoint error in the feature plane: the study's own
@@ -27,10 +27,14 @@ from study.geometry import principal_axes
 from study.methods.cpd import Cpd
 from study.methods.icp import Icp
 from study.methods.nonrigid_icp import NonrigidIcp, Step
+from study.methods.skeleton_graph import SkeletonGraphMethod
+from study.methods.visible_surface import VisibleSurface
 from study.metrics import hausdorff_mm, point_errors_mm
+from study.som import SomParams
 from study.types import Floats, Method, PointCloud
 
 PAIRS = (("ct1", 102), ("ct2", 103), ("ct3", 104))  # source subject and cohort seed; the target is its "patient"
+GRIDS = ("icp", "nonrigid_icp", "cpd", "skeleton_graph", "visible_surface")
 MEASURES = ("waypoint_error_inplane_mm", "waypoint_error_mm", "true_error_mm", "hd_mm", "converged")
 
 
@@ -57,11 +61,12 @@ def development_case(name: str, seed: int) -> Case:
     source = phantom.reference_cloud(ct, 9000, rng)
     target = phantom.anterior_cloud(us, 6600, 0.5, 4, rng)
     # As in the study, nothing but the points goes into the coarse alignment.
-    start = align(PointCloud(source.points, source.name), PointCloud(target.points, target.name)).T_us_ct
+    alignment = align(PointCloud(source.points, source.name), PointCloud(target.points, target.name))
+    start = alignment.T_us_ct
     return Case(
         name=f"{name}@{seed}",
-        source=source.moved(start),
-        target=target,
+        source=alignment.source.cloud.moved(start),
+        target=alignment.target.cloud,
         truth=phantom.truth_map(ct, us, source.points),
         waypoints=start.apply(phantom.waypoints(ct).points),
         true_waypoints=phantom.waypoints(us).points,
@@ -95,8 +100,20 @@ def grid(name: str) -> Iterator[Method]:
         yield Cpd()
         for beta, alpha, share in product((30.0, 50.0, 80.0, 120.0), (0.2, 2.0), (0.0, 0.1)):
             yield Cpd(beta_mm=beta, alpha=alpha, outlier_share=share)
+    elif name == "skeleton_graph":
+        yield SkeletonGraphMethod()
+        for radius, schedule in product((2.0, 3.0, 4.0, 5.0), ("constant", "linear")):
+            som = SomParams(radius=radius, rate_schedule=schedule)
+            yield SkeletonGraphMethod(ct_som=som, us_som=som)
+        for winners, n_reg in product(("any", "own_part"), (2, 3)):
+            som = SomParams(rate_schedule="linear", winners=winners)
+            yield SkeletonGraphMethod(som, som, n_reg, "hops", blend_weights="inverse_distance")
+    elif name == "visible_surface":  # each tuned method on the whole tube and on its visible half
+        for tuned in (Icp.tuned(), NonrigidIcp.tuned(), Cpd.tuned(), SkeletonGraphMethod.tuned()):
+            yield tuned
+            yield VisibleSurface(tuned)
     else:
-        raise SystemExit(f"expected icp, nonrigid_icp or cpd, got {name!r}")
+        raise SystemExit(f"expected one of {', '.join(GRIDS)}, got {name!r}")
 
 
 def run_grid(methods: Iterable[Method], cases: list[Case]) -> pd.DataFrame:
@@ -104,7 +121,7 @@ def run_grid(methods: Iterable[Method], cases: list[Case]) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for setting, method in enumerate(methods):
         for case in cases:
-            row = {"setting": setting, "case": case.name, **asdict(method)}  # type: ignore[call-overload]
+            row = {"setting": setting, "case": case.name, "name": label(method), **asdict(method)}  # type: ignore[call-overload]
             try:
                 result = method.register(case.source, case.target, np.random.default_rng(0))
                 moved = result.transfer(case.waypoints)
@@ -126,6 +143,11 @@ def run_grid(methods: Iterable[Method], cases: list[Case]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def label(method: Method) -> str:
+    """The method's name, and whether it sees the visible half only."""
+    return f"{method.method.name}, visible surface" if isinstance(method, VisibleSurface) else method.name
+
+
 def summarise(table: pd.DataFrame) -> pd.DataFrame:
     """Mean over the cases, best setting first; a setting that failed on a case cannot be the best."""
     parameters = list(table.columns[2 : table.columns.get_loc("waypoint_error_inplane_mm")])
@@ -139,7 +161,7 @@ def summarise(table: pd.DataFrame) -> pd.DataFrame:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("methods", nargs="*", default=["icp", "nonrigid_icp", "cpd"])
+    parser.add_argument("methods", nargs="*", default=list(GRIDS))
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results" / "tuning")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
