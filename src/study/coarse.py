@@ -12,6 +12,7 @@ from study.sternum import SternumFit, SternumParams, feature_plane, sternum_cand
 from study.types import CARTILAGES, ChestFrame, Floats, Part, PointCloud, RigidTransform
 
 MIN_BULGE_MM = 0.2
+MIN_BEND_RATIO = 1.8  # sound clouds reach 3 and more; a sweep whose lines are shifted against each other falls to 1
 MAX_OFFSET_MM = 15.0  # between the two roots of a level: people differ by up to 8, a missing branch shifts by a level
 
 
@@ -94,6 +95,12 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
     bend_low, bend_high = (
         float(np.mean([_bend_mm(local[numbers == k]) for k in ends])) for ends in ((1, 5), (4, 8))
     )
+    ratio = max(bend_low, bend_high) / max(min(bend_low, bend_high), 1e-9)
+    if ratio < MIN_BEND_RATIO:
+        raise StudyError(
+            f"{cloud.name}: expected 5th cartilages that bend {MIN_BEND_RATIO:g} times as much as the 2nd or more, got "
+            f"{ratio:.2f}, so head and foot look alike; is a latency left in, or a line of the sweep out of place?"
+        )
     # Half a turn about y looks from the other face, half a turn about z turns the foot down: never a reflection.
     if bulge < 0:
         T_cloud_sternum = T_cloud_sternum @ RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
@@ -106,8 +113,7 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
     parts = np.array(names, dtype=np.int64)[numbers + 1]
     front = sternum_front_mm(T_cloud_sternum.inverse.apply(cloud.points), p)
     T_cloud_chest = T_cloud_sternum @ RigidTransform(np.eye(3), np.array([0.0, 0.0, front]))
-    ratio = max(bend_low, bend_high) / max(min(bend_low, bend_high), 1e-9)
-    return Chest(replace(cloud, parts=parts), T_cloud_chest, search.fit.overlap, float(ratio), abs(bulge), search)
+    return Chest(replace(cloud, parts=parts), T_cloud_chest, search.fit.overlap, ratio, abs(bulge), search)
 
 
 def _sternum_with_branches(
