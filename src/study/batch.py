@@ -308,6 +308,7 @@ def run_study(
     """
     chosen = _chosen(methods)
     manifest = manifest or load_manifest()
+    pairs(dataset, params, manifest)  # an unknown dataset leaves no folder
     out.mkdir(parents=True, exist_ok=True)  # a folder that can't be written is better known now than after the run
     started = datetime.now(UTC)
     rows, timings = run_dataset(

@@ -1,0 +1,109 @@
+"""`study run --dataset ribseg` on loopback: archives under the real names, phantom CTs, RibSeg's rib labels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from http_archive import RIBFRAC_PATH, ArchiveServer, rebased_manifest, ribfrac_zip, ribseg_zip
+from phantom_files import SMALL, nifti, ribseg_labels, scan, structure_ids
+
+from study.batch import run_study
+from study.cohorts import files_of_subject
+from study.data.manifest import load_manifest
+from study.data.volumes import read_labels
+from study.results import FAILED, read_metrics, sha256_of
+
+SCANS = {421: "ct1", 441: "ct2"}
+DAMAGED = 461
+METHODS = ("coarse", "icp")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, ArchiveServer]:
+    """Results of a run, its manifest, and the server it fetched from; one of the three scans is damaged."""
+    folder = tmp_path_factory.mktemp("ribseg")
+    images, labels = {}, {}
+    for number, name in SCANS.items():
+        image, ids = scan(name, flat=True)
+        images[number] = nifti(image, folder / "made" / f"{number}.nii.gz").read_bytes()
+        labels[number] = nifti(ribseg_labels(ids), folder / "made" / f"{number}-ribs.nii.gz").read_bytes()
+    images[DAMAGED], labels[DAMAGED] = images[421][:-5000], labels[421]
+    with pytest.MonkeyPatch.context() as patch, ArchiveServer() as server:
+        patch.setenv("STUDY_DATA_DIR", str(folder / "data"))
+        patch.setenv("NO_PROXY", "127.0.0.1")
+        server.files[RIBFRAC_PATH] = ribfrac_zip(images)
+        (folder / "ribseg_v2.zip").write_bytes(ribseg_zip(labels))
+        sha256 = sha256_of(folder / "ribseg_v2.zip")
+        path = rebased_manifest(folder / "manifest.yaml", server.url, keep=["ribseg"], ribseg_sha256=sha256)
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        subjects = raw["cohorts"]["ribseg"]["subjects"]
+        raw["cohorts"]["ribseg"]["subjects"] = {f"ribfrac{n}": subjects[f"ribfrac{n}"] for n in (*SCANS, DAMAGED)}
+        path.write_text(yaml.safe_dump(raw), encoding="utf-8")
+        manifest = load_manifest(path)
+        params = replace(SMALL, max_sources=0, max_targets=0)
+        run_study("ribseg", params, folder / "out", methods=METHODS, manifest=manifest)
+        files = files_of_subject("ribseg", "ribfrac421", manifest)
+        assert read_labels(files["ribseg421_ribs"]).values.max() <= 24
+    return folder / "out", path, server
+
+
+def test_the_labels_hold_ribs_only_numbered_from_the_right() -> None:
+    """The stand-in is what RibSeg gives: no cartilage, no sternum, right ribs first."""
+    _, labels = scan("ct1", flat=True)
+    ribs = ribseg_labels(labels)
+    ids = structure_ids()
+    assert set(np.unique(ribs.values)) == {0, *range(1, 8), *range(13, 20)}  # seven ribs reach the front
+    assert np.array_equal(ribs.values == 2, labels.values == ids["rib_right_2"])
+    assert np.array_equal(ribs.values == 14, labels.values == ids["rib_left_2"])
+    where = [ribs.to_mm(np.argwhere(ribs.values == rib)).mean(axis=0) for rib in (2, 14)]
+    assert where[0][0] > where[1][0]  # RAS+: x grows to the right
+    assert not (ribs.values[np.isin(labels.values, [ids["sternum"], ids["costal_cartilages"]])]).any()
+
+
+def test_every_pair_of_whole_scans_runs_with_every_method(run: tuple[Path, Path, ArchiveServer]) -> None:
+    metrics = read_metrics(run[0] / "metrics.csv")
+    whole = metrics[~metrics["status"].str.startswith(FAILED)]
+    cases = whole.groupby(["subject", "target", "method"]).size()
+    assert set(cases.index) == {
+        (f"ribfrac{a}", f"ribfrac{b}", method) for a, b in ((421, 441), (441, 421)) for method in METHODS
+    }
+    assert set(cases) == {3 + 2 * 20}  # distances, and 20 waypoints with all errors and those in the plane
+    assert set(whole["status"]) <= {"ok", "not converged"}
+    assert set(whole[whole["method"] == "coarse"]["status"]) == {"ok"}
+    errors = whole[whole["metric"] == "waypoint_error"].groupby("method")["value"].mean()
+    assert errors.max() < 12.0  # two people, overlaid at their sternums; swapped levels are 30 mm apart
+
+
+def test_the_damaged_scan_is_rows_with_its_reason(run: tuple[Path, Path, ArchiveServer]) -> None:
+    metrics = read_metrics(run[0] / "metrics.csv")
+    failed = metrics[metrics["status"].str.startswith(FAILED)]
+    assert len(failed) == 4 * len(METHODS)
+    assert ((failed["subject"] == "ribfrac461") | (failed["target"] == "ribfrac461")).all()
+    assert failed["status"].str.contains("truncated or damaged").all()
+
+
+def test_tables_print_their_n(run: tuple[Path, Path, ArchiveServer]) -> None:
+    table = pd.read_csv(run[0] / "hd_all_pairs.csv")
+    ours = table[table["data"] == "this study"]
+    assert ours["n"].to_list() == [2, 2]
+    assert ours["n_failed"].to_list() == [4, 4]
+    assert (run[0] / "hd_table_ribfrac421.md").is_file()
+
+
+def test_the_archive_was_read_by_ranges_and_the_inputs_are_on_record(run: tuple[Path, Path, ArchiveServer]) -> None:
+    out, manifest, server = run
+    assert server.requests
+    assert all(request.first is not None for request in server.requests)
+    inputs = json.loads((out / "provenance.json").read_text())["inputs_sha256"]
+    assert set(inputs) == {manifest.name} | {
+        f"{kind}{number}_{what}"
+        for number in (*SCANS, DAMAGED)
+        for kind, what in (("ribfrac", "ct"), ("ribseg", "ribs"))
+    }
+    assert inputs["ribfrac421_ct"] == sha256_of(out.parent / "made" / "421.nii.gz")
