@@ -16,7 +16,14 @@ from study.figures.registration import (
     som_progress,
     transferred_path,
 )
-from study.figures.statistics import error_budget, hd_bars, sensitivity, waypoint_boxes
+from study.figures.statistics import (
+    error_budget,
+    error_views,
+    hd_bars,
+    paired_differences,
+    sensitivity,
+    waypoint_boxes,
+)
 from study.figures.style import (
     METHOD_STYLE,
     PART_COLOUR,
@@ -44,6 +51,7 @@ __all__ = [
     "coarse_steps",
     "ct_slice",
     "error_budget",
+    "error_views",
     "frame_with_mask",
     "graph_triptych",
     "hd_bars",
@@ -52,6 +60,7 @@ __all__ = [
     "mesh_and_cloud",
     "method_style",
     "one_way",
+    "paired_differences",
     "png",
     "pose_gallery",
     "registration_grid",
