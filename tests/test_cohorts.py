@@ -9,12 +9,10 @@ import yaml
 from phantom_files import (
     SMALL,
     cached_ct_volume,
-    landmark_file,
     nifti,
     own_manifest,
     ribseg_labels,
     scan,
-    structure_ids,
 )
 from scipy.spatial import KDTree
 
