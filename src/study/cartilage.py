@@ -6,17 +6,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
-from skimage.segmentation import watershed
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 from sklearn.cluster import KMeans
 
 from study.errors import StudyError
 from study.geometry import close_gaps, pixelise, sample_spacing_mm
 from study.types import Bools, Floats, Ints
 
-PIXEL_MM = 2.0
-BANDS_MM = ((2.0, 14.0), (6.0, 18.0), (10.0, 22.0), (14.0, 26.0))  # outwards from the sternum's edge; roots may touch
-MAX_GAP_MM = 20.0  # an unreached piece farther than this from every branch stays unlabelled
+PIXEL_MM = 1.0
+BANDS_MM = ((2.0, 14.0), (6.0, 18.0), (10.0, 22.0), (14.0, 26.0), (2.0, 26.0))  # outwards from the sternum's edge
+GAP_COST = 3.0  # of crossing an empty pixel, against 1 along a cartilage
+MAX_GAP_MM = 20.0  # a piece farther than this from every branch belongs to none
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ def sternum_edge_mm(points: Floats, height_mm: float, sign: int) -> float:
     """Distance from the centreline to where the covered part of a parallel line drops (sec. III-A.2).
 
     The line is covered whole on the sternum and only where cartilages leave it outside; the edge is where the
-    coverage passes the middle between the two.
+    coverage last passes the middle between the two. The last, since a strip missed by the sweep may split the sternum.
 
     Args:
         points: (n, 2) mm in sternum coordinates.
@@ -50,13 +52,13 @@ def sternum_edge_mm(points: Floats, height_mm: float, sign: int) -> float:
     inside = (np.abs(y) < rows * PIXEL_MM / 2) & (x >= 0) & (x < 60.0)
     image = np.zeros((int(60 / PIXEL_MM), rows), dtype=bool)
     image[(x[inside] / PIXEL_MM).astype(int), ((y[inside] + rows * PIXEL_MM / 2) / PIXEL_MM).astype(int)] = True
-    covered = close_gaps(image, round(2 * sample_spacing_mm(points) / PIXEL_MM)).mean(axis=1)
-    covered = np.convolve(np.pad(covered, 1, mode="edge"), np.ones(3) / 3, mode="valid")
+    covered = close_gaps(image, int(np.ceil(sample_spacing_mm(points) / PIXEL_MM))).mean(axis=1)
+    covered = np.convolve(np.pad(covered, 2, mode="edge"), np.ones(5) / 5, mode="valid")
     lines = np.arange(len(covered)) * PIXEL_MM + PIXEL_MM / 2
-    on = covered[lines < 10].mean()
-    off = covered[(lines > 10) & (lines < 40)].min()
-    below = np.flatnonzero((covered < (on + off) / 2) & (lines > 6))
-    return float(lines[below[0]]) if below.size else float(lines[-1])
+    on = covered[lines < 12].max()
+    off = np.median(covered[(lines > 24) & (lines < 40)])
+    above = np.flatnonzero((covered >= (on + off) / 2) & (lines < 30))
+    return float(lines[above[-1]] + PIXEL_MM) if above.size else float(lines[0])
 
 
 def find_branches(points: Floats, height_mm: float, name: str = "cloud") -> Branches:
@@ -71,36 +73,57 @@ def find_branches(points: Floats, height_mm: float, name: str = "cloud") -> Bran
         StudyError: a side on which four separate branches do not leave the sternum.
     """
     image, pixels, origin = pixelise(points, PIXEL_MM, pad=4)
-    image = close_gaps(image, round(2 * sample_spacing_mm(points) / PIXEL_MM))
+    image = close_gaps(image, int(np.ceil(sample_spacing_mm(points) / PIXEL_MM)))
     x = np.arange(image.shape[0])[:, None] * PIXEL_MM + origin[0]
     edges = (sternum_edge_mm(points, height_mm, -1), sternum_edge_mm(points, height_mm, 1))
     sternum = (x >= -edges[0]) & (x <= edges[1])
-    markers = np.zeros(image.shape, dtype=np.int64)
-    seeds = []
-    for side, (sign, edge) in enumerate(zip((-1, 1), edges, strict=True)):
-        seeds.append(_seeds(image, sign * x - edge, side, name) * PIXEL_MM + origin)
-        for k, seed in enumerate(seeds[-1]):
-            row, column = np.round((seed - origin) / PIXEL_MM).astype(int)
-            markers[row, column] = 1 + 4 * side + k
-    free = image & ~sternum
-    flooded = watershed(np.zeros(image.shape), markers, mask=free)  # all eight fills grow at one pace
-    flooded = _adopt_islands(flooded, free)
-    flooded[sternum & image] = 9
-    found = flooded[pixels[:, 0], pixels[:, 1]]
-    branch = np.where(found == 9, 0, np.where(found == 0, -1, found)).astype(np.int64)
-    return Branches(branch, edges, np.concatenate(seeds))
+    seeds = [
+        _seeds(image, sign * x - edge, side, name) for side, (sign, edge) in enumerate(zip((-1, 1), edges, strict=True))
+    ]
+    starts = np.concatenate(seeds)
+    flooded = _flood(image, np.broadcast_to(sternum, image.shape), starts.astype(np.int64))
+    branch = flooded[pixels[:, 0], pixels[:, 1]]
+    return Branches(branch, edges, starts * PIXEL_MM + origin)
+
+
+def _flood(image: Bools, sternum: Bools, starts: Ints) -> Ints:
+    """Give every pixel beside the sternum to the seed that reaches it first; 0 on the sternum, -1 where none can.
+
+    The paper floods one branch after another, which leaks where neighbours touch and stops at a missed strip. Here
+    all eight fills grow at one pace, and a pixel that the cloud left empty costs more to cross but can be crossed.
+    """
+    passable = ~sternum & (distance_transform_edt(~image) * PIXEL_MM <= MAX_GAP_MM / 2)
+    number = np.arange(image.size).reshape(image.shape)
+    cost = np.where(image, 1.0, GAP_COST)
+    rows, columns, weights = [], [], []
+    for step, length in (((0, 1), 1.0), ((1, 0), 1.0), ((1, 1), np.sqrt(2)), ((1, -1), np.sqrt(2))):
+        near = (slice(0, image.shape[0] - step[0]), slice(max(0, -step[1]), image.shape[1] - max(0, step[1])))
+        far = (slice(step[0], None), slice(max(0, step[1]), image.shape[1] + min(0, step[1])))
+        open_ = passable[near] & passable[far]
+        rows.append(number[near][open_])
+        columns.append(number[far][open_])
+        weights.append((cost[near][open_] + cost[far][open_]) * length / 2)
+    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+    grid = csr_array(entries, shape=(image.size, image.size))
+    origins = number[tuple(starts.T)]
+    _, _, source = dijkstra(grid, directed=False, indices=origins, min_only=True, return_predecessors=True)
+    order = np.argsort(origins)
+    branch = order[np.searchsorted(origins, np.maximum(source, origins.min()), sorter=order) % len(origins)] + 1
+    branch = np.where(source < 0, -1, branch).reshape(image.shape)
+    return np.where(sternum, 0, branch).astype(np.int64)
 
 
 def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> Floats:
     """Four cluster centres beside the sternum (k-means), each snapped to a pixel of its cluster, by rising y.
 
-    The roots of neighbours may touch, so the search moves outwards until no two centres lie on one cartilage.
+    The roots of neighbours may touch and a sweep may miss a strip, so the search moves outwards until no two centres
+    lie on one cartilage.
     """
     where = ("left", "right")[side]
     for near, far in BANDS_MM:
         candidates = np.argwhere(image & (outwards_mm >= near) & (outwards_mm <= far))
         if len(candidates) < 8:
-            break
+            continue
         quarters = np.array_split(candidates[np.argsort(candidates[:, 1], kind="stable")], 4)
         clusters = KMeans(n_clusters=4, init=np.array([quarter.mean(axis=0) for quarter in quarters])).fit(candidates)
         seeds = []
@@ -119,19 +142,3 @@ def _joined(image: Bools, one: Ints, other: Ints) -> bool:
     """Whether the straight line between two pixels stays on the cartilage."""
     steps = np.linspace(one, other, 4 * int(np.ceil(np.linalg.norm(other - one))) + 2)
     return bool(image[tuple(np.round(steps).astype(int).T)].all())
-
-
-def _adopt_islands(flooded: Ints, free: np.ndarray) -> Ints:
-    """Give each piece that no fill reached to the branch whose pixels come closest to it."""
-    islands, count = label(free & (flooded == 0), structure=np.ones((3, 3)))
-    if count == 0:
-        return flooded
-    distance, nearest = distance_transform_edt(flooded == 0, return_indices=True)
-    result = flooded.copy()
-    for island in range(1, count + 1):
-        members = np.argwhere(islands == island)
-        gap = distance[tuple(members.T)]
-        if gap.min() * PIXEL_MM <= MAX_GAP_MM:
-            touch = members[np.argmin(gap)]
-            result[islands == island] = flooded[tuple(nearest[:, touch[0], touch[1]])]
-    return result
