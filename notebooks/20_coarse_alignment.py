@@ -138,8 +138,9 @@ left_over
 # %% [markdown]
 # ## Any pose
 # Both clouds again, each turned at random over all rotations. A pose counts as right only if the recovered chest axes
-# are the true ones turned by less than 40° (a swap of sides, of head and foot or of front and back turns them by 180°),
-# they are right-handed, and at least four in five points got their own side and level. A mirrored anatomy fails all three.
+# are the true ones turned by less than 40° (a swap of sides, of head and foot or of front and back turns them by
+# 180°), they are right-handed, and at least four in five points got their own side and level. A mirrored anatomy
+# fails all three.
 
 # %%
 truth = {"CT": anatomy.cloud, "US": patient.labelled.moved(patient.T_us_ras.inverse)}  # both in RAS+

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from study.ct import (
     LABEL_MAPS,
     check_rib_labels,
+    on_grid,
     parts_from_labels,
     points_for_spacing,
     rib_name,
@@ -172,6 +173,22 @@ def test_cloud_is_even_labelled_and_repeatable() -> None:
         sample_cloud(mesh, 10, np.random.default_rng(1))
     with pytest.raises(StudyError, match="positive spacing"):
         points_for_spacing(mesh, 0.0)
+
+
+def test_parts_move_to_another_grid_by_the_nearest_voxel() -> None:
+    rng = np.random.default_rng(3)
+    turn = RigidTransform.random(rng)
+    parts = rng.integers(-1, 9, (12, 10, 8)).astype(np.int8)
+    mask = Volume(parts, np.array([1.0, 1.0, 1.0]), turn, "mask")
+    first = turn.apply(np.array([[-2.2, 1.1, 0.4]]))[0]  # starts outside the mask
+    like = Volume(np.zeros((9, 6, 5)), np.array([0.7, 1.3, 2.5]), RigidTransform(turn.rotation, first), "ct")
+    moved = on_grid(mask, like)
+    for index in np.ndindex(like.shape):
+        at = np.rint(mask.to_index(like.to_mm(np.array([index])))[0]).astype(int)
+        inside = (at >= 0).all() and (at < mask.shape).all()
+        assert moved.values[index] == (parts[tuple(at)] if inside else Part.UNKNOWN)
+    with pytest.raises(StudyError, match="axes of ct"):
+        on_grid(Volume(parts, mask.spacing_mm, RigidTransform(), "straight"), like)
 
 
 PROGRAM = """

@@ -241,6 +241,30 @@ def span_sternum(roi: Volume, sternum: Bools, parts: NDArray[Any], to_sternum: F
     return _largest(span)
 
 
+def on_grid(mask: Volume, like: Volume) -> Volume:
+    """The parts at the voxel centres of another volume: the nearest voxel's, `Part.UNKNOWN` outside the mask.
+
+    Args:
+        mask: `Part` values.
+        like: gives the grid; its axes are the mask's.
+
+    Raises:
+        StudyError: axes that are not parallel.
+    """
+    if not np.allclose(mask.T_ras_index.rotation, like.T_ras_index.rotation, atol=1e-4):
+        raise StudyError(f"{mask.name}: expected the axes of {like.name}, got others; resample one of them first")
+    values = ndimage.affine_transform(
+        np.asarray(mask.values, dtype=np.int8),
+        like.spacing_mm / mask.spacing_mm,
+        offset=mask.to_index(like.to_mm(np.zeros((1, 3))))[0],
+        output_shape=like.shape,
+        order=0,
+        mode="constant",
+        cval=int(Part.UNKNOWN),
+    )
+    return Volume(values, like.spacing_mm, like.T_ras_index, mask.name)
+
+
 def surface(mask: Volume, smooth_mm: float = 1.0) -> Mesh:
     """The outer surface of a mask of parts.
 
