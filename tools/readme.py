@@ -27,6 +27,7 @@ def pooled(metrics: pd.DataFrame, metric: str, method: str) -> str:
 
 
 def table() -> str:
+    """The table in Markdown, with what its columns are."""
     runs = {name: read_metrics(ROOT / "results" / "reference" / name / "metrics.csv") for name in ("phantom", "open")}
     hd, waypoints = paper_hd_table(), paper_waypoints()
     rows = []
@@ -44,13 +45,14 @@ def table() -> str:
     note = (
         f"\nMean ± population SD, mm. Phantom: {pairs['phantom']} synthetic CTs to one synthetic patient; open: "
         f"{pairs['open']} ordered pairs of real people, the target under a virtual sweep. The paper's columns are other "
-        "data: its five CTs and its volunteer. `_tuned` methods have parameters from development subjects and register "
-        "only the surface that ultrasound can see.\n"
+        "data: its five CTs and its volunteer. `_tuned` methods have parameters from development subjects and "
+        "register only the surface that ultrasound can see.\n"
     )
     return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n" + note
 
 
 def main() -> int:
+    """Rewrite or compare the part between the markers."""
     text = README.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN)
     new = before + BEGIN + table() + END + rest.split(END, 1)[1]

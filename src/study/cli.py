@@ -142,6 +142,33 @@ def report(folder: Path) -> None:
             click.echo(f"{label}: {place}")
 
 
+@cli.command(short_help="Measure cartilages and sternum of every CT of a cohort.")
+@click.option("--dataset", default="open", show_default=True, metavar="D", help="A cohort with images.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Table to write, .csv.")
+def anatomy(dataset: str, out: Path) -> None:
+    """Measure length, width, thickness, curvature and density of cartilages 2-5, and the sternum, per subject."""
+    import pandas as pd
+
+    from study.anatomy import measure_anatomy
+    from study.cohorts import load_anatomy, pairs
+    from study.params import find_profile
+    from study.results import write_text
+
+    params = find_profile("full")
+    names = dict.fromkeys(name for pair in pairs(dataset, params) for name in pair)
+    tables = []
+    for name in names:
+        subject = load_anatomy(dataset, name, params)
+        if subject.image is None or subject.mask is None:
+            raise StudyError(f"{dataset}: expected subjects with images, got {name} without; name another cohort")
+        tables.append(measure_anatomy(subject.image, subject.mask, name))
+    table = pd.concat(tables, ignore_index=True)
+    write_text(out, table.to_csv(index=False, lineterminator="\n"))
+    sizes = table[table["quantity"].isin(["length", "width", "thickness", "density_mean"])]
+    click.echo(sizes.pivot_table(index="part", columns="quantity", values="value", sort=False).round(1).to_string())
+    click.echo(f"{len(table)} measurements of {len(names)} subjects: {out}")
+
+
 @cli.command(short_help="Check a run against a reference.")
 @click.argument("reference", type=click.Path(path_type=Path))
 @click.argument("candidate", type=click.Path(path_type=Path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -92,7 +93,7 @@ def cloud_errors(
     wide, tall = np.ptp(extent, axis=0)
     figure = new_figure(0.9 + (WIDTH_IN - 1.6) / len(clouds) * tall / wide, "Distance of the cloud to the true surface")
     panels = figure.subplots(1, len(clouds), squeeze=False)[0]
-    drawn = None
+    drawn: Any = None
     for ax, (name, (points, distance)) in zip(panels, clouds.items(), strict=True):
         draw_surface(ax, vertices, mesh.faces, np.full((len(vertices), 3), 0.93))
         values = np.asarray(distance, dtype=np.float64)
