@@ -42,13 +42,16 @@ check: $(STAMP)  ## ruff, types, import layers, notebook pairing
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/notebooks.py check
+	$(BIN)/python tools/readme.py check
 
 notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
 	$(BIN)/python tools/notebooks.py write
 
 reference: $(STAMP)  ## renew results/reference from results/runs (a CHANGELOG entry says why)
 	for d in phantom open planted; do \
-	  mkdir -p results/reference/$$d && cp -r $(RUNS)/$$d/. results/reference/$$d/; done
+	  rm -rf results/reference/$$d && cp -r $(RUNS)/$$d results/reference/$$d; done
+	$(BIN)/study anatomy --dataset open --out results/anatomy.csv
+	$(BIN)/python tools/readme.py write
 
 bench: $(STAMP)  ## ratios and rates quoted in the README
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done

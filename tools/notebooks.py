@@ -92,10 +92,17 @@ def main() -> int:
     os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # else its banner is the first output
     todo = [s for s in sources() if not chosen.names or any(s.stem.startswith(name) for name in chosen.names)]
-    for number, source in enumerate(todo, 1):
-        print(f"notebook {number} of {len(todo)}: {source.stem}", flush=True)
-        folder = chosen.out if chosen.verb == "run" else NOTEBOOKS
-        execute(source, folder / f"{source.stem}.ipynb", {"profile": chosen.profile})
+    jobs = [(source, source.stem, {"profile": chosen.profile}) for source in todo]
+    if chosen.verb == "run":  # the study of one dataset, for each of them
+        jobs += [
+            (source, f"{source.stem}-{dataset}", {"profile": chosen.profile, "dataset": dataset})
+            for source in todo
+            if source.stem.endswith("_study")
+            for dataset in ("open", "planted")
+        ]
+    for number, (source, stem, parameters) in enumerate(jobs, 1):
+        print(f"notebook {number} of {len(jobs)}: {stem}", flush=True)
+        execute(source, (chosen.out if chosen.verb == "run" else NOTEBOOKS) / f"{stem}.ipynb", parameters)
     return 0
 
 

@@ -44,8 +44,8 @@ def table() -> str:
     pairs = {name: len(m.drop_duplicates(["subject", "target"])) for name, m in runs.items()}
     note = (
         f"\nMean ± population SD, mm. Phantom: {pairs['phantom']} synthetic CTs to one synthetic patient; open: "
-        f"{pairs['open']} ordered pairs of real people, the target under a virtual sweep. The paper's columns are other "
-        "data: its five CTs and its volunteer. `_tuned` methods have parameters from development subjects and "
+        f"{pairs['open']} ordered pairs of real people, the target under a virtual sweep. The paper's columns are "
+        "other data: its five CTs and its volunteer. `_tuned` methods have parameters from development subjects and "
         "register only the surface that ultrasound can see.\n"
     )
     return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n" + note
