@@ -15,6 +15,8 @@ profile = "full"  # full or quick
 seed = 0
 
 # %%
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 
@@ -84,8 +86,15 @@ print(f"{len(people)} of {len(entries)} subjects: {', '.join(people)}")
 one_of_each = {how[name]: name for name in reversed(people)}  # the first of each kind
 names = dict.fromkeys([*reversed(one_of_each.values()), *people])
 examples = [people[name] for name in list(names)[:2]]
+
+
+def slices(one):
+    """A subject's parts on its CT, under the subject's name."""
+    return figures.ct_slice(replace(one.image, name=one.name), on_grid(one.mask, one.image))
+
+
 print(" and ".join(f"{one.name}, cut by {how[one.name]}" for one in examples))
-figures.ct_slice(examples[0].image, on_grid(examples[0].mask, examples[0].image))
+slices(examples[0])
 
 # %%
 figures.mesh_and_cloud(examples[0].mesh, examples[0].cloud)
@@ -95,7 +104,7 @@ figures.mesh_and_cloud(examples[0].mesh, examples[0].cloud)
 # a grid of its own, here laid over the voxels of the CT.
 
 # %%
-figures.ct_slice(examples[-1].image, on_grid(examples[-1].mask, examples[-1].image))
+slices(examples[-1])
 
 # %%
 figures.mesh_and_cloud(examples[-1].mesh, examples[-1].cloud)
@@ -162,7 +171,9 @@ else:
 agreement.round(2).to_frame() if agreement is not None else None
 
 # %%
-figures.ct_slice(labelled.image, ours, reference=theirs, at_mm=places[far.argmax()]) if judged else None
+figures.ct_slice(
+    replace(labelled.image, name=judged), ours, reference=theirs, at_mm=places[far.argmax()]
+) if judged else None
 
 # %% [markdown]
 # ## How large the cartilages are
@@ -173,10 +184,7 @@ figures.ct_slice(labelled.image, ours, reference=theirs, at_mm=places[far.argmax
 # %%
 measured = [measure_anatomy(one.image, one.mask, name) for name, one in people.items() if one.image is not None]
 long = pd.concat(measured)
-long["rib"] = (
-    long["part"].str.extract(r"_(\d)$", expand=False).map("rib {}".format).where(long["part"].str.contains("_"))
-)
-long["rib"] = long["rib"].fillna(long["part"])
+long["part"] = long["part"].str.replace(r"^(right|left)_", "rib ", regex=True)  # the mean of both sides
 kept = long[long["quantity"].isin(["length", "width", "thickness"]) | (long["part"] == "cartilages")]
 anatomy = kept.pivot_table(index=["part", "quantity", "unit"], columns="subject", values="value", sort=False)
 anatomy[list(people)].round(2)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from study import ct
 from study.ct import (
     LABEL_MAPS,
     check_rib_labels,
-    on_grid,
     parts_from_labels,
     points_for_spacing,
     rib_name,
@@ -174,13 +174,13 @@ def test_parts_move_to_another_grid_by_the_nearest_voxel() -> None:
     mask = Volume(parts, np.array([1.0, 1.0, 1.0]), turn, "mask")
     first = turn.apply(np.array([[-2.2, 1.1, 0.4]]))[0]  # starts outside the mask
     like = Volume(np.zeros((9, 6, 5)), np.array([0.7, 1.3, 2.5]), RigidTransform(turn.rotation, first), "ct")
-    moved = on_grid(mask, like)
+    moved = ct.on_grid(mask, like)
     for index in np.ndindex(like.shape):
         at = np.rint(mask.to_index(like.to_mm(np.array([index])))[0]).astype(int)
         inside = (at >= 0).all() and (at < mask.shape).all()
         assert moved.values[index] == (parts[tuple(at)] if inside else Part.UNKNOWN)
     with pytest.raises(StudyError, match="axes of ct"):
-        on_grid(Volume(parts, mask.spacing_mm, RigidTransform(), "straight"), like)
+        ct.on_grid(Volume(parts, mask.spacing_mm, RigidTransform(), "straight"), like)
 
 
 PROGRAM = """
