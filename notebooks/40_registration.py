@@ -1,0 +1,174 @@
+# %% [markdown]
+# # What does each method make of the same pair?
+#
+# One CT, one patient, one coarse alignment, and every method of the study from there: sections III-C, III-D and IV of
+# the paper. The skeleton graph moves each CT point by a blend of the local motions of its nearest nodes (Eqs. 3 and 4);
+# the baselines are ICP, Amberg's non-rigid ICP and coherent point drift. A planned path is then carried to the patient
+# by the sphere of section III-D (Fig. 4a), in the same way for every method.
+#
+# **What is real and what is not.** In the phantom both people are synthetic. In `open` the CTs are real people, in
+# `planted` a real CT is deformed by a known map. The ultrasound cloud is simulated in every case, by a virtual tracked
+# sweep over the patient's surface.
+
+# %% tags=["parameters"]
+dataset = "phantom"  # phantom, open or planted
+profile = "full"  # full or quick
+seed = 0
+
+# %%
+import numpy as np
+import pandas as pd
+
+from study import METHODS, figures
+from study.coarse import align
+from study.cohorts import load_anatomy, make_patient, pairs, truth_map
+from study.metrics import (
+    directed_distances_mm,
+    hausdorff_mm,
+    hd95_mm,
+    mean_surface_distance_mm,
+    population_sd,
+    waypoint_errors_mm,
+)
+from study.params import check_parameters, find_profile
+from study.pipeline import named_rng, register_aligned
+from study.waypoints import intercostal_waypoints
+
+check_parameters(globals(), dataset=str, profile=str, seed=int)
+params = find_profile(profile)
+pd.options.display.max_colwidth = None
+
+# %% [markdown]
+# ## The pair
+# The CT cloud is the whole surface of sternum and cartilages 2 to 5. The ultrasound cloud is only what faces the probe,
+# in the frame of a tracker whose base may be anywhere.
+
+# %%
+source, target = pairs(dataset, params)[0]
+anatomy = load_anatomy(dataset, source, params, seed)
+patient = make_patient(load_anatomy(dataset, target, params, seed), params, seed)
+alignment = align(anatomy.cloud, patient.cloud)
+T_us_chest = alignment.target.T_cloud_chest
+us = alignment.target.cloud.points
+pd.DataFrame({"points": [len(anatomy.cloud), len(us)]}, index=[f"CT of {source}", f"US of {target}, simulated"])
+
+# %% [markdown]
+# ## Every method from the same start
+# `coarse` is the start itself. A plain name is the method as published, or as its library ships it. A name with
+# `_tuned` has its parameters from a small grid on development subjects that are reported nowhere else, and it
+# registers only the half of the tubes that a probe can see. Seconds are of this machine and this run.
+
+# %%
+results = {
+    name: register_aligned(alignment, method, named_rng(seed, f"{source}/{target}/{name}"))
+    for name, method in METHODS.items()
+}
+pd.DataFrame(
+    {
+        name: {
+            "converged": result.converged,
+            "iterations": result.n_iterations,
+            "why it stopped": result.stop_reason,
+            "seconds": round(result.seconds, 1),
+            "warnings": "; ".join(result.warnings) or "none",
+        }
+        for name, result in results.items()
+    }
+).T
+
+# %% [markdown]
+# ## Overlays
+# Grey is the ultrasound cloud; each CT point is coloured by its distance to it. Seen from the front, a rigid method
+# leaves the ends of the cartilages apart where two people differ. Seen from the right, the whole tube of the CT lies
+# over a sheet: a method that only asks for small distances pulls the tube flat onto the sheet, back side and all.
+
+# %%
+figures.registration_grid({name: result.warped for name, result in results.items()}, us, T_us_chest=T_us_chest)
+
+# %% [markdown]
+# Distances between the clouds, in mm: the Hausdorff distance of Eq. 5 over all points, its 95th percentile and the mean
+# of both directions; then the two directed Hausdorff distances, from CT to US and from US to CT. Where the first of
+# them is the larger, the worst point is one of the CT that ultrasound had not seen.
+
+# %%
+surface = pd.DataFrame(
+    {
+        name: {
+            "HD (Eq. 5)": hausdorff_mm(result.warped, us),
+            "HD, 95 %": hd95_mm(result.warped, us),
+            "mean": mean_surface_distance_mm(result.warped, us),
+            "CT to US, largest": directed_distances_mm(result.warped, us).max(),
+            "US to CT, largest": directed_distances_mm(us, result.warped).max(),
+        }
+        for name, result in results.items()
+    }
+).T
+surface.round(2)
+
+# %% [markdown]
+# ## The path, carried over
+# The 20 waypoints lie in the intercostal spaces, where there is no cartilage to register; each is moved by the rigid
+# motion of the CT points within the sphere around it. Hollow circles are the waypoints that the protocol defines on the
+# patient's own cloud (k-means parts of each cartilage, midpoints between neighbours); dotted lines are the errors.
+
+# %%
+moved = {name: result.transfer(anatomy.waypoints.points, params.radius_mm) for name, result in results.items()}
+protocol = intercostal_waypoints(patient.labelled)
+figures.transferred_path(us, protocol, moved, T_us_chest=T_us_chest)
+
+# %% [markdown]
+# ## Against the protocol, and against the truth
+# The paper can only compare with the waypoints that its protocol defines on the patient. Here the deformation is
+# known on `phantom` and `planted`, so the same transferred waypoints are also judged by where they truly belong. The
+# column in the feature plane leaves depth out; the last one is the mean depth error alone, positive to the front.
+
+# %%
+normal = T_us_chest.rotation[:, 2]
+truth = truth_map(dataset, anatomy, target)
+goals = {"protocol": protocol.points}
+if truth is not None:
+    goals["truth"] = patient.T_us_ras.apply(truth(anatomy.waypoints.points))
+errors = pd.DataFrame(
+    {
+        (judge, what): {name: value for name, points in moved.items() for value in [measure(points, goal)]}
+        for judge, goal in goals.items()
+        for what, measure in {
+            "mean (mm)": lambda points, goal: waypoint_errors_mm(points, goal).mean(),
+            "SD (mm)": lambda points, goal: population_sd(waypoint_errors_mm(points, goal)),
+            "largest (mm)": lambda points, goal: waypoint_errors_mm(points, goal).max(),
+            "in the plane (mm)": lambda points, goal: waypoint_errors_mm(points, goal, normal).mean(),
+            "depth (mm)": lambda points, goal: ((points - goal) @ normal).mean(),
+        }.items()
+    }
+)
+errors.assign(n=len(protocol)).round(2)
+
+# %% [markdown]
+# Two things to see where the truth is known. In the feature plane the methods that bend beat the rigid ones by either
+# judge. But the methods as published that do best by the protocol are several millimetres too far to the front by the
+# truth: they lay the middle of the tube on its visible front, and the protocol's waypoints on the ultrasound cloud
+# share that shift. The tuned ones, which fit front to front, keep the depth right and look worse to the protocol.
+
+# %% [markdown]
+# ## What this shows
+# Every method answers in the same form, row i for CT point i, so one transfer serves all; a rigid method's path is its
+# own motion exactly. The skeleton graph as published carries the path better than the coarse alignment it starts from.
+
+# %%
+assert list(results) == list(METHODS), "every method must have answered"
+for name, result in results.items():
+    assert result.warped.shape == anatomy.cloud.points.shape, f"{name}: expected one row per CT point"
+    if np.allclose(result.warped, result.T_us_ct.apply(anatomy.cloud.points), atol=1e-9):
+        carried = result.T_us_ct.apply(anatomy.waypoints.points)
+        # A rigid fit to exactly paired points has no error but rounding: coordinates of some 1,000 mm in float64.
+        assert np.abs(moved[name] - carried).max() < 1e-6, f"{name}: a rigid path must be its own motion"
+graph, start = ("skeleton_graph", "coarse")
+in_plane = errors["truth" if truth is not None else "protocol", "in the plane (mm)"]
+# The issue of this study asks 2.5 mm in the feature plane; the quick profile has a third of the points, and two real
+# people differ in more than the phantom's deformations do, so there it must only improve on its start.
+assert in_plane[graph] < in_plane[start], f"expected an improvement on the coarse alignment, got {in_plane.to_dict()}"
+if dataset == "phantom" and profile == "full":
+    assert in_plane[graph] <= 2.5, f"expected at most 2.5 mm in the feature plane, got {in_plane[graph]:.2f}"
+# ICP minimises distances, so its clouds cannot be farther apart than where it started; 0.05 mm is that metric's
+# tolerance between machines.
+assert surface.loc["icp", "mean"] <= surface.loc[start, "mean"] + 0.05, "ICP must bring the clouds closer"
