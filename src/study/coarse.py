@@ -13,7 +13,10 @@ from study.types import CARTILAGES, ChestFrame, Floats, Part, PointCloud, RigidT
 
 MIN_BULGE_MM = 0.2
 MIN_BEND_RATIO = 1.8  # sound clouds reach 3 and more; a sweep whose lines are shifted against each other falls to 1
-MAX_OFFSET_MM = 15.0  # between the two roots of a level: people differ by up to 8, a missing branch shifts by a level
+# What tells eight cartilages from eight pieces of something else; on whole chests 9 or less, 18 or more, 24 or more.
+MAX_OFFSET_MM = 15.0  # along the sternum between the two roots of a level; a missing branch shifts by a level, 20-35
+MIN_APART_MM = 12.0  # between the roots of neighbours
+MIN_LENGTH_MM = 15.0  # beside the sternum
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,7 @@ def _sternum_with_branches(
         local = T_plane_sternum.inverse.apply(lifted)[:, :2]
         try:
             branches = find_branches(local, params.height_mm, name)
-            _check_pairs(branches, name)
+            _check_branches(branches, local, name)
         except StudyError as error:
             first_error = first_error or error
             continue
@@ -150,13 +153,20 @@ def _sternum_with_branches(
     )
 
 
-def _check_pairs(branches: Branches, name: str) -> None:
-    """Refuse four branches a side that face gaps: a rectangle laid askew can find eight where one is missing."""
-    offset = float(np.abs(branches.seeds[:4, 1] - branches.seeds[4:, 1]).max())
-    if offset > MAX_OFFSET_MM:
+def _check_branches(branches: Branches, local: Floats, name: str) -> None:
+    """Refuse eight pieces that are no cartilages: a rectangle laid askew can find four a side where one is missing."""
+    roots = branches.seeds[:, 1].reshape(2, 4)
+    offset = float(np.abs(roots[0] - roots[1]).max())
+    apart = float(np.diff(roots, axis=1).min())
+    lengths = []
+    for k in range(1, 9):
+        beside = np.abs(local[branches.branch == k, 0]) - branches.half_widths_mm[k > 4]
+        lengths.append(float(np.percentile(beside, 98)) if beside.size else 0.0)
+    if offset > MAX_OFFSET_MM or apart < MIN_APART_MM or min(lengths) < MIN_LENGTH_MM:
         raise StudyError(
-            f"{name}: expected cartilages that leave the sternum in pairs up to {MAX_OFFSET_MM:g} mm apart along it, "
-            f"got {offset:.0f} mm; is a branch missing, or does the cloud hold more than cartilages 2-5?"
+            f"{name}: expected four cartilages a side that leave the sternum in pairs (up to {MAX_OFFSET_MM:g} mm), at "
+            f"least {MIN_APART_MM:g} mm apart and {MIN_LENGTH_MM:g} mm long, got {offset:.0f}, {apart:.0f} and "
+            f"{min(lengths):.0f} mm; is a branch missing, or does the cloud hold more than cartilages 2-5?"
         )
 
 
