@@ -68,6 +68,14 @@ def mask(chest: tuple[Volume, dict[str, np.ndarray]]) -> Volume:
     return parts_from_labels(chest[0], IDS)
 
 
+def on_grid(mask: Volume, labels: Volume, part: Part) -> np.ndarray:
+    """A part as a boolean array on the labels' own grid."""
+    whole = np.zeros(labels.shape, dtype=bool)
+    index = np.rint(labels.to_index(mask.to_mm(np.argwhere(mask.values == part)))).astype(int)
+    whole[tuple(index.T)] = True
+    return whole
+
+
 def test_every_cartilage_is_whole_and_apart(mask: Volume, chest: tuple[Volume, dict[str, np.ndarray]]) -> None:
     labels, drawn = chest
     assert set(np.unique(mask.values)) == {int(part) for part in Part}

@@ -259,7 +259,7 @@ def on_grid(mask: Volume, like: Volume) -> Volume:
         offset=mask.to_index(like.to_mm(np.zeros((1, 3))))[0],
         output_shape=like.shape,
         order=0,
-        mode="constant",
+        mode="grid-constant",  # "constant" would cut half a voxel off every side
         cval=int(Part.UNKNOWN),
     )
     return Volume(values, like.spacing_mm, like.T_ras_index, mask.name)
