@@ -151,10 +151,10 @@ def label(method: Method) -> str:
 def summarise(table: pd.DataFrame) -> pd.DataFrame:
     """Mean over the cases, best setting first; a setting that failed on a case cannot be the best."""
     parameters = list(table.columns[2 : table.columns.get_loc("waypoint_error_inplane_mm")])
-    summary = table.assign(failed=table["status"] != "ok").groupby("setting", as_index=False).agg(
-        {name: "first" for name in parameters}
-        | dict.fromkeys(MEASURES, "mean")
-        | {"failed": "sum"}
+    summary = (
+        table.assign(failed=table["status"] != "ok")
+        .groupby("setting", as_index=False)
+        .agg({name: "first" for name in parameters} | dict.fromkeys(MEASURES, "mean") | {"failed": "sum"})
     )
     return summary.sort_values(["failed", "waypoint_error_inplane_mm"], kind="stable")
 

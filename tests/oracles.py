@@ -54,11 +54,13 @@ def toy_chest(rng: np.random.Generator, n: int = 4000, *, anterior: bool = False
 def bend(points: Floats, size: float = 1.0) -> Floats:
     """A smooth planted deformation of a chest: stretch, twist-free bend and a breath; ``size`` 1 is some 6 mm."""
     x, y, z = points.T
-    return np.column_stack([
-        x * (1 + 0.05 * size),
-        y + size * (4 * np.cos(x / 60) - 2),
-        z + size * (6 * np.sin(x / 50) + 0.04 * (z - 15)),
-    ])
+    return np.column_stack(
+        [
+            x * (1 + 0.05 * size),
+            y + size * (4 * np.cos(x / 60) - 2),
+            z + size * (6 * np.sin(x / 50) + 0.04 * (z - 15)),
+        ]
+    )
 
 
 def contract_pair(n_source: int = 1500, n_target: int = 1200) -> tuple[PointCloud, PointCloud, Floats]:

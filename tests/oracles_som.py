@@ -61,11 +61,13 @@ def rigid_literal(source: Floats, target: Floats) -> tuple[Floats, Floats]:
     n[0, 1:] = n[1:, 0] = delta
     n[1:, 1:] = s + s.T - np.trace(s) * np.eye(3)
     w, x, y, z = np.linalg.eigh(n)[1][:, -1]
-    rotation = np.array([
-        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-    ])
+    rotation = np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
     return rotation, target.mean(axis=0) - rotation @ source.mean(axis=0)
 
 

@@ -61,9 +61,7 @@ def template_graph(frame: ChestFrame) -> SkeletonGraph:
 def _row_heights_mm(frame: ChestFrame, sides: tuple[str, ...]) -> Floats:
     """Height of every grid row: each level's middle row at the measured root of its cartilage, the others between."""
     middle = np.array([rows[1] for rows in BRANCH_ROWS.values()], dtype=np.float64)
-    roots = np.array(
-        [np.mean([frame.root_mm[Part.cartilage(side, level)] for side in sides]) for level in BRANCH_ROWS]
-    )
+    roots = np.array([np.mean([frame.root_mm[Part.cartilage(side, level)] for side in sides]) for level in BRANCH_ROWS])
     pitch = (roots[-1] - roots[0]) / (middle[-1] - middle[0])
     rows = np.arange(STERNUM_SHAPE[0], dtype=np.float64)
     heights = np.interp(rows, middle, roots)

@@ -566,5 +566,3 @@ class Method(Protocol):
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Register labelled, coarsely aligned clouds: ``warped`` row i is source point i in the target frame."""
         ...
-
-

@@ -85,10 +85,12 @@ class Cpd:
                 tolerance=self.tolerance,
             )
             drift.register(lambda **_: history.append(float(np.sqrt(drift.sigma2))))
-            warped = centre + np.vstack([
-                rows + np.exp(-cdist(rows, control, "sqeuclidean") / (2 * self.beta_mm**2)) @ drift.W
-                for rows in np.split(moving, range(_ROWS, len(moving), _ROWS))
-            ])
+            warped = centre + np.vstack(
+                [
+                    rows + np.exp(-cdist(rows, control, "sqeuclidean") / (2 * self.beta_mm**2)) @ drift.W
+                    for rows in np.split(moving, range(_ROWS, len(moving), _ROWS))
+                ]
+            )
         if not np.isfinite(warped).all():
             raise StudyError(f"cpd: expected finite points from {source.name!r}, got NaN; raise alpha or outlier_share")
         converged = bool(drift.diff <= self.tolerance)
