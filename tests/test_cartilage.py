@@ -58,7 +58,7 @@ def test_a_piece_far_from_every_branch_belongs_to_none():
 def test_three_branches_on_a_side_are_refused(skip):
     points, _ = drawing(skip=skip)
     where = "left" if skip[0] < 0 else "right"
-    with pytest.raises(StudyError, match=f"toy: expected 4 separate cartilages at the {where} of the sternum .* got fewer"):
+    with pytest.raises(StudyError, match=f"toy: expected 4 separate cartilages at the {where} of the sternum"):
         find_branches(points, 90.0, "toy")
 
 

@@ -81,7 +81,7 @@ def test_two_chests_are_overlaid(ct_clouds, us_cloud):
 def test_a_missing_part_is_an_error(name, part, ct_clouds, us_cloud):
     cloud = us_cloud if name == "us" else ct_clouds[name]
     pose = RigidTransform.random(np.random.default_rng(int(part)))
-    with pytest.raises(StudyError, match=r"expected 4 separate|expected four cartilages a side|no sternum found") as info:
+    with pytest.raises(StudyError, match=r"expected (4 separate|four) cartilages|no sternum found") as info:
         find_chest(PointCloud(pose.apply(cloud.points[cloud.parts != part]), "torn"))
     assert "torn" in str(info.value)
 
@@ -89,7 +89,7 @@ def test_a_missing_part_is_an_error(name, part, ct_clouds, us_cloud):
 def test_branches_that_face_gaps_are_refused(ct_clouds):
     cloud = ct_clouds["ct5"]
     torn = PointCloud(cloud.points[cloud.parts != Part.RIGHT_5], "torn")
-    with pytest.raises(StudyError, match=r"expected four cartilages a side that leave the sternum in pairs.* mm; is a branch"):
+    with pytest.raises(StudyError, match=r"four cartilages a side that leave the sternum in pairs.* mm; is a branch"):
         find_chest(torn)
 
 

@@ -74,7 +74,7 @@ def test_a_rectangle_has_one_area_at_every_angle_and_turns_counter_clockwise():
 def test_the_symmetry_axis_of_a_planted_symmetric_drawing(angle_deg, shift_mm):
     half = drawing(np.random.default_rng(1))
     half = half[half[:, 0] > 0]
-    whole = np.concatenate([half, half * [-1, 1]]) + [shift_mm, 0]
+    whole = np.concatenate([half, half * [-1, 1]]) + np.array([shift_mm, 0])
     angle, shift = symmetry_axis(turned(whole, angle_deg))
     assert angle == pytest.approx(angle_deg, abs=3.0)  # bars without texture leave it that much play
     assert shift == pytest.approx(shift_mm, abs=2.0)  # one pixel

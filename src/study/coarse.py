@@ -17,6 +17,7 @@ MIN_BEND_RATIO = 1.8  # sound clouds reach 3 and more; a sweep whose lines are s
 MAX_OFFSET_MM = 15.0  # along the sternum between the two roots of a level; a missing branch shifts by a level, 20-35
 MIN_APART_MM = 12.0  # between the roots of neighbours
 MIN_LENGTH_MM = 15.0  # beside the sternum
+MAX_FILL = 0.6  # density of points between neighbours over that on them: a plate has 0.85 or more, a chest 0.3 or less
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,7 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
             f"{cloud.name}: expected cartilages that arch {MIN_BULGE_MM} mm or more to the front, got "
             f"{abs(bulge):.2f} mm, so front and back look alike; give the cloud its `front` direction"
         )
-    bend_low, bend_high = (
-        float(np.mean([_bend_mm(local[numbers == k]) for k in ends])) for ends in ((1, 5), (4, 8))
-    )
+    bend_low, bend_high = (float(np.mean([_bend_mm(local[numbers == k]) for k in ends])) for ends in ((1, 5), (4, 8)))
     ratio = max(bend_low, bend_high) / max(min(bend_low, bend_high), 1e-9)
     if ratio < MIN_BEND_RATIO:
         raise StudyError(
@@ -119,9 +118,7 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
     return Chest(replace(cloud, parts=parts), T_cloud_chest, search.fit.overlap, ratio, abs(bulge), search)
 
 
-def _sternum_with_branches(
-    flat: Floats, params: SternumParams, name: str
-) -> tuple[ChestSearch, RigidTransform]:
+def _sternum_with_branches(flat: Floats, params: SternumParams, name: str) -> tuple[ChestSearch, RigidTransform]:
     """The best covered rectangle that four separate branches leave on each side, and T_plane_sternum."""
     first_error: StudyError | None = None
     best = 0.0
@@ -168,6 +165,21 @@ def _check_branches(branches: Branches, local: Floats, name: str) -> None:
             f"least {MIN_APART_MM:g} mm apart and {MIN_LENGTH_MM:g} mm long, got {offset:.0f}, {apart:.0f} and "
             f"{min(lengths):.0f} mm; is a branch missing, or does the cloud hold more than cartilages 2-5?"
         )
+    seeds = branches.seeds.reshape(2, 4, 2)
+    between = (seeds[:, :-1] + seeds[:, 1:]) / 2
+    fill = _count_near(local, between).mean() / max(_count_near(local, seeds).mean(), 1e-9)
+    if fill > MAX_FILL:
+        raise StudyError(
+            f"{name}: expected open spaces between the cartilages, got {fill:.2f} of their own density there, "
+            f"need {MAX_FILL:g} or less; crop to sternum and cartilages of ribs 2-5"
+        )
+
+
+def _count_near(local: Floats, places: Floats) -> Floats:
+    """Number of points in a 20 × 5 mm window around each place (..., 2)."""
+    flat = places.reshape(-1, 2)
+    near = np.abs(local[:, None] - flat[None]) < (10.0, 2.5)
+    return near.all(axis=2).sum(axis=0).astype(np.float64)
 
 
 def _turn(angle: float, shift: Floats) -> RigidTransform:

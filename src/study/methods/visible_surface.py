@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from study.coarse import chest_frame
 from study.errors import StudyError
-from study.geometry import fit_rigid_batch
+from study.geometry import fit_rigid_batch, sample_spacing_mm
 from study.types import Bools, ChestFrame, Floats, Method, PointCloud, Registration
 
 
@@ -20,10 +20,11 @@ def faces_front(points: Floats, frame: ChestFrame, cell_mm: float = 4.0, depth_m
     Args:
         points: (n, 3) mm.
         frame: the chest's left, up and front.
-        cell_mm: edge of the cells across the view.
+        cell_mm: edge of the cells across the view; wider where a sparse cloud would leave one point in each.
         depth_mm: how far behind the foremost point still counts.
     """
     local = frame.T_cloud_chest.inverse.apply(points)
+    cell_mm = max(cell_mm, 2.5 * sample_spacing_mm(points))
     cells = np.floor(local[:, :2] / cell_mm).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     foremost = np.full(cell.max() + 1, -np.inf)
