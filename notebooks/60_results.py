@@ -232,7 +232,8 @@ pd.Series(floor, name="Hausdorff distance (mm)").round(2).to_frame()
 # ## The paper's claims, one at a time
 # The claim as the paper makes it, then what came out on each data set with the methods as published. `k of n` counts
 # pairs. The last rows ask what the paper does not: whether the order survives tuned baselines, and whether it
-# holds by the truth.
+# holds by the truth. Where ICP is not the worst, look at CPD as shipped: with its kernel in units of the data it hardly
+# moves a cloud in millimetres.
 
 # %%
 BASELINES = ["icp", "nonrigid_icp", "cpd"]
@@ -341,7 +342,8 @@ for name in runs:
     means = per_pair[name, "waypoint_error"].groupby("method").mean()
     best = means.idxmin()
     summary.append(
-        f"- `{name}` (n = {about[name]['pairs']} pairs): mean waypoint error of the skeleton graph as published "
+        f"- `{name}` (n = {per_pair[name, 'waypoint_error', GRAPH].size} of {about[name]['pairs']} pairs registered): "
+        f"mean waypoint error of the skeleton graph as published "
         f"{means[GRAPH]:.2f} mm, from {means['coarse']:.2f} mm after coarse alignment; smallest of all methods: "
         f"`{best}` with {means[best]:.2f} mm."
     )
@@ -359,8 +361,9 @@ display(Markdown("\n".join(["## What this shows", *summary])))
 assert dataset in runs, "the data set asked for must be there"
 for name in runs:
     means = per_pair[name, "waypoint_error"].groupby("method").mean()
-    failed = runs[name].query("metric == @CASE and method == @GRAPH")
-    assert failed.empty, f"{name}: the skeleton graph failed on {len(failed)} pairs"
+    # A pair that the coarse alignment refused is lost to every method; nothing else may be, or means would not compare.
+    counts = per_pair[name, "waypoint_error"].groupby("method").size()
+    assert counts[GRAPH] == counts["coarse"] > 0, f"{name}: pairs behind the means differ: {counts.to_dict()}"
     # The paper's central claim against what cannot adapt to a person's shape; no margin, as any loss would refute it.
     for rigid in ("coarse", "icp"):
         assert means[GRAPH] < means[rigid], f"{name}: expected {GRAPH} below {rigid}, got {means.to_dict()}"
