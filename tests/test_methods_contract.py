@@ -29,7 +29,7 @@ def pair(ct_clouds, us_cloud) -> tuple[PointCloud, PointCloud]:
         rows = rng.permutation(len(cloud))[:n]
         return PointCloud(cloud.points[rows], cloud.name, cloud.parts[rows])
 
-    return thin(alignment.source.cloud.moved(alignment.T_us_ct), 900), thin(alignment.target.cloud, 700)
+    return thin(alignment.source.cloud.moved(alignment.T_us_ct), 700), thin(alignment.target.cloud, 500)
 
 
 def run(name: str, source: PointCloud, target: PointCloud, seed: int = 0) -> Registration:
