@@ -30,7 +30,7 @@ study: $(STAMP)  ## run the whole study; prints the tables and where the figures
 	$(BIN)/study run --dataset phantom --jobs $(JOBS) --out $(RUNS)/phantom
 	$(BIN)/study run --dataset open --jobs $(JOBS) --out $(RUNS)/open
 	$(BIN)/study run --dataset planted --jobs $(JOBS) --out $(RUNS)/planted
-	$(BIN)/python tools/notebooks.py run --out $(RUNS)/notebooks
+	$(BIN)/python tools/notebooks.py run --jobs $(JOBS) --out $(RUNS)/notebooks
 	$(BIN)/study report $(RUNS)
 
 test: $(STAMP)  ## every test, and the notebooks on the quick profile
@@ -45,7 +45,7 @@ check: $(STAMP)  ## ruff, types, import layers, notebook pairing
 	$(BIN)/python tools/readme.py check
 
 notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
-	$(BIN)/python tools/notebooks.py write
+	$(BIN)/python tools/notebooks.py write --jobs $(JOBS)
 
 reference: $(STAMP)  ## renew results/reference from results/runs (a CHANGELOG entry says why)
 	for d in phantom open planted; do \
