@@ -67,12 +67,12 @@ def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
     assert {path.name for path in first.iterdir()} == {
         "metrics.csv", "timings.csv", "provenance.json", "hd_table.csv", "hd_table.md", "hd_table.tex"
     }  # fmt: skip
-    assert " n " in (first / "hd_table.md").read_text()
+    assert " n " in (first / "hd_table.md").read_text(encoding="utf-8")
     timings = pd.read_csv(first / "timings.csv")
     assert timings["stage"].value_counts().to_dict() == {
         "anatomy": 2, "sweep": 1, "coarse ct": 1, "coarse us": 1, "register": 2
     }  # fmt: skip
-    provenance = json.loads((first / "provenance.json").read_text())
+    provenance = json.loads((first / "provenance.json").read_text(encoding="utf-8"))
     assert provenance["parameters"]["study"]["ct_points"] == SMALL.ct_points
     assert sorted(provenance["parameters"]["methods"]) == list(METHODS)
     assert list(provenance["inputs_sha256"]) == ["data_manifest.yaml"]
@@ -107,7 +107,7 @@ def test_a_subject_that_fails_is_rows_with_the_reason_and_the_rest_goes_on(
     ours = table[table["data"] == "this study"].set_index("method")
     assert ours["n"].to_list() == [1, 1]
     assert ours["n_failed"].to_list() == [1, 1]
-    assert "1 failed" in (tmp_path / "hd_table.md").read_text()
+    assert "1 failed" in (tmp_path / "hd_table.md").read_text(encoding="utf-8")
 
 
 def test_a_patient_that_fails_takes_every_case_with_it_and_that_is_an_error(
@@ -224,4 +224,4 @@ def test_one_ct_with_several_patients_has_them_as_columns(tmp_path: Path) -> Non
 
 def test_a_table_of_failures_only_can_be_written(tmp_path: Path) -> None:
     write_tables(pd.DataFrame([failed_row("d", s, "p", "icp", 0, "no sternum") for s in "ab"]), tmp_path)
-    assert "2 failed" in (tmp_path / "hd_table.md").read_text()
+    assert "2 failed" in (tmp_path / "hd_table.md").read_text(encoding="utf-8")

@@ -104,7 +104,10 @@ def test_study_alone_prints_the_commands(capsys: Capture) -> None:
 
 def test_the_module_exits_with_the_code_and_no_traceback() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "study.cli", "run", "--profile", "fast"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "study.cli", "run", "--profile", "fast"],
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
     )
     assert done.returncode == 2
     assert done.stderr == "study: expected a profile among full, quick, got 'fast'\n"
@@ -159,7 +162,7 @@ def test_a_bad_manifest_names_its_key(tmp_path: Path, capsys: Capture) -> None:
 def test_a_run_that_cannot_be_written_is_refused_before_it_starts(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "file").write_text("mine")
     assert "file" in refused(capsys, "run", "--profile", "quick", "--methods", "coarse", "--out", "file")
-    assert (tmp_path / "file").read_text() == "mine"
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
 
 
 def test_ribseg_without_its_labels_says_what_to_download_and_where_to_put_it(tmp_path: Path, capsys: Capture) -> None:
@@ -184,7 +187,7 @@ def test_two_clouds_are_registered_and_written(clouds: Path, tmp_path: Path, cap
     assert written == {"warped.ply", "registration.json", "waypoints_us.csv"}
     assert all(name in out for name in written)
     ct, us, warped = (read_ply(path) for path in (clouds / "ct.ply", clouds / "us.ply", tmp_path / "out/warped.ply"))
-    T = np.array(json.loads((tmp_path / "out" / "registration.json").read_text())["T_us_ct"])
+    T = np.array(json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))["T_us_ct"])
     assert np.allclose(ct @ T[:3, :3].T + T[:3, 3], warped, atol=1e-9)  # ICP is rigid: row i is CT point i
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
     assert np.linalg.norm(warped.mean(axis=0) - us.mean(axis=0)) < 25.0
@@ -202,7 +205,9 @@ def test_the_default_method_keeps_the_rows(clouds: Path, tmp_path: Path, capsys:
     before, after = (np.linalg.norm(np.diff(points[some], axis=1)[:, 0], axis=1) for points in (ct, warped))
     assert np.corrcoef(before, after)[0, 1] > 0.9  # neighbours stay neighbours only if the order is kept
     assert not (tmp_path / "out" / "waypoints_us.csv").exists()
-    assert json.loads((tmp_path / "out" / "registration.json").read_text())["method"] == "skeleton_graph"
+    assert (
+        json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))["method"] == "skeleton_graph"
+    )
 
 
 @pytest.mark.parametrize("fault", ["nan", "metres", "five", "garbage", "flat", "waypoint", "method", "columns"])
@@ -275,7 +280,7 @@ def test_a_manifest_of_ones_own_runs_compares_and_reports(tmp_path: Path, capsys
     assert set(zip(metrics["subject"], metrics["target"], strict=True)) == {("ct2", "ct1")}
     assert set(metrics[metrics["method"] == "coarse"]["status"]) == {"ok"}
     assert not metrics["metric"].str.startswith("true").any()  # between two people no truth is known
-    inputs = json.loads((tmp_path / "runs" / "mine" / "provenance.json").read_text())["inputs_sha256"]
+    inputs = json.loads((tmp_path / "runs" / "mine" / "provenance.json").read_text(encoding="utf-8"))["inputs_sha256"]
     assert inputs["ct1_ct"] == sha256_of(tmp_path / "mine" / "scans" / "ct1_ct.nii.gz")
 
     assert main(["report", "runs"]) == 0
@@ -320,7 +325,7 @@ def test_compare_agrees_differs_and_cannot(tmp_path: Path, capsys: Capture) -> N
         (tmp_path / name / "metrics.csv").write_text(text)
         assert name in refused(capsys, "compare", reference, name)
     shutil.copytree(reference, tmp_path / "no_rows")
-    rows = (tmp_path / "no_rows" / "metrics.csv").read_text().splitlines()
+    rows = (tmp_path / "no_rows" / "metrics.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "no_rows" / "metrics.csv").write_text(rows[0] + "\n")
     assert "at least one row" in refused(capsys, "compare", reference, "no_rows")
 

@@ -204,7 +204,7 @@ print(hashlib.sha256(cloud.points.tobytes()).hexdigest())
 
 def test_cloud_is_the_same_in_another_process() -> None:
     runs = [
-        subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True).stdout
+        subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, encoding="utf-8", check=True).stdout
         for _ in range(2)
     ]
     assert runs[0] == runs[1]

@@ -86,10 +86,10 @@ def test_a_registration_is_written_whole(tmp_path: Path) -> None:
     }  # fmt: skip
     assert len(lines) == 3
     assert np.array_equal(read_ply(tmp_path / "out" / "warped.ply"), result.warped)
-    summary = json.loads((tmp_path / "out" / "registration.json").read_text())
+    summary = json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))
     assert np.array_equal(summary["T_us_ct"], T.matrix)
     assert (summary["converged"], summary["warnings"]) == (False, ["few points"])
-    header, *rows = (tmp_path / "out" / "waypoints_us.csv").read_text().splitlines()
+    header, *rows = (tmp_path / "out" / "waypoints_us.csv").read_text(encoding="utf-8").splitlines()
     assert header == "x,y,z"
     assert np.array_equal([[float(value) for value in row.split(",")] for row in rows], moved)
 

@@ -357,7 +357,7 @@ def test_the_first_fetch_sets_the_hash_and_later_ones_are_held_to_it(
     manifest = write(ribfrac_zip({421: noise(1)}), "RibFrac421-image.nii.gz")
     file = manifest.file("ct")
     path = fetch(file, web=FAST)
-    (entry,) = yaml.safe_load((folder / "data_lock.yaml").read_text()).values()
+    (entry,) = yaml.safe_load((folder / "data_lock.yaml").read_text(encoding="utf-8")).values()
     assert entry["sha256"] == hashlib.sha256(noise(1)).hexdigest()
     path.unlink()
     server.files[RIBFRAC_PATH] = ribfrac_zip({421: noise(2)})

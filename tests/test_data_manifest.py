@@ -212,7 +212,7 @@ def test_a_fault_is_named_by_its_key(broken: Callable[..., str], change: Callabl
 
 def test_the_line_is_the_one_in_the_file(broken: Callable[..., str], tmp_path: Path) -> None:
     message = broken(_set(*LIDC, "sha256", "abc"))
-    lines = (tmp_path / "data_manifest.yaml").read_text().splitlines()
+    lines = (tmp_path / "data_manifest.yaml").read_text(encoding="utf-8").splitlines()
     number = 1 + next(i for i, line in enumerate(lines) if line.strip() == "sha256: abc")
     assert message == f"data_manifest.yaml: files.lidc_ct.sha256 (line {number}): expected 64 hex digits, got 'abc'"
 

@@ -81,7 +81,9 @@ def test_every_notebook_runs_on_the_quick_profile(source, tmp_path):
 def test_papermill_itself_fails_on_an_unknown_parameter_from_any_directory(tmp_path):
     notebook = ROOT / "notebooks" / "50_study.ipynb"
     command = [sys.executable, "-m", "papermill", str(notebook), "out.ipynb", "-p", "sed", "1", "-k", tool.KERNEL]
-    done = subprocess.run(command, cwd=tmp_path, env=dict(os.environ), capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=dict(os.environ), capture_output=True, encoding="utf-8", timeout=120
+    )
     assert done.returncode != 0
     assert "got unknown sed" in done.stderr
 

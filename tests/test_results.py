@@ -95,7 +95,7 @@ def test_a_killed_write_leaves_the_old_file(tmp_path, monkeypatch):
     monkeypatch.setattr("pathlib.Path.replace", dies)
     with pytest.raises(KeyboardInterrupt):
         write_text(path, "new")
-    assert path.read_text() == "old"
+    assert path.read_text(encoding="utf-8") == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["metrics.csv"]
 
 
@@ -123,7 +123,7 @@ def edited(text, old, new):
 def test_other_schemas_are_refused_and_located(tmp_path, spoil, message):
     path = tmp_path / "metrics.csv"
     write_metrics(some_rows(), path)
-    path.write_text(spoil(path.read_text()))
+    path.write_text(spoil(path.read_text(encoding="utf-8")))
     with pytest.raises(StudyError, match=message):
         read_metrics(path)
 
@@ -189,14 +189,14 @@ def test_tables_are_written_three_ways(run, tmp_path):
     assert written.loc[("icp", "this study"), "ct1"] == hd_table(metrics).loc["icp", "ct1"]
     assert len(written) == 2 + 4
     markdown, latex = (tmp_path / f"hd_table.{kind}" for kind in ("md", "tex"))
-    assert markdown.read_text().count("\n| ") == 1 + 6
-    assert "failed" in markdown.read_text()
-    text = latex.read_text()
+    assert markdown.read_text(encoding="utf-8").count("\n| ") == 1 + 6
+    assert "failed" in markdown.read_text(encoding="utf-8")
+    text = latex.read_text(encoding="utf-8")
     assert text.count(r"$\pm$") == 1 + 6
     assert r"skeleton\_graph" in text
     assert text.isascii()
     write_hd_table(metrics, tmp_path / "errors", "waypoint_error")
-    assert "paper" not in (tmp_path / "errors.md").read_text()
+    assert "paper" not in (tmp_path / "errors.md").read_text(encoding="utf-8")
 
 
 def test_two_datasets_do_not_share_a_table(run):
@@ -294,7 +294,7 @@ def test_provenance_holds_what_a_reader_needs(tmp_path):
     start, end = datetime(2024, 1, 1, 12, tzinfo=UTC), datetime(2024, 1, 1, 12, 1, tzinfo=UTC)
     record = provenance({"icp": Icp(), "grid": np.arange(2), "out": tmp_path}, 7, {"ct": "ab"}, start, end, tmp_path)
     write_json(record, tmp_path / "provenance.json")
-    read = json.loads((tmp_path / "provenance.json").read_text())
+    read = json.loads((tmp_path / "provenance.json").read_text(encoding="utf-8"))
     assert read["lock_sha256"] == sha256_of(tmp_path / "environment.lock")
     assert read["parameters"]["icp"]["max_iterations"] == 30
     assert read["parameters"]["grid"] == [0, 1]
@@ -315,7 +315,7 @@ def test_provenance_knows_the_commit_of_a_checkout():
 def test_timings_are_sorted(tmp_path):
     row = {"dataset": "phantom", "subject": "ct1", "target": "patient", "method": "icp", "seed": 0, "seconds": 0.5}
     write_timings([{**row, "stage": "register"}, {**row, "stage": "align"}], tmp_path / "timings.csv")
-    lines = (tmp_path / "timings.csv").read_text().splitlines()
+    lines = (tmp_path / "timings.csv").read_text(encoding="utf-8").splitlines()
     assert [line.split(",")[5] for line in lines] == ["stage", "align", "register"]
 
 

@@ -99,7 +99,7 @@ def check_the_archive_was_read_by_ranges_and_the_inputs_are_on_record(
 ) -> None:
     assert server.requests
     assert all(request.first is not None for request in server.requests)
-    inputs = json.loads((out / "provenance.json").read_text())["inputs_sha256"]
+    inputs = json.loads((out / "provenance.json").read_text(encoding="utf-8"))["inputs_sha256"]
     assert set(inputs) == {manifest.name} | {
         f"{kind}{number}_{what}"
         for number in (*SCANS, DAMAGED)
