@@ -28,6 +28,7 @@ from http_archive import (
     ribseg_zip,
     totalsegmentator_zip,
 )
+from pypi_simple import PYPI_SIMPLE_ENDPOINT
 
 from study.data import fetch as fetching
 from study.data.fetch import data_dir, data_list, fetch, fetch_all, path_of, status, verify, verify_all
@@ -625,7 +626,7 @@ def test_the_index_is_the_one_pip_is_set_up_with(monkeypatch: pytest.MonkeyPatch
     for variable in ("PIP_INDEX_URL", "UV_INDEX_URL", "UV_DEFAULT_INDEX"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
-    assert index_url() == "https://pypi.org/simple/"
+    assert index_url() == PYPI_SIMPLE_ENDPOINT
     config = tmp_path / "pip.conf"
     config.write_text("[global]\nindex-url = https://example.org/%20/simple\n")
     monkeypatch.setenv("PIP_CONFIG_FILE", str(config))
