@@ -65,4 +65,4 @@ def register_pair(
     """
     chosen = find_method(method)
     alignment = align(PointCloud(as_points(ct_points, "ct"), "ct"), PointCloud(as_points(us_points, "us"), "us"))
-    return register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"))
+    return replace(register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}")), method=method)

@@ -109,7 +109,7 @@ def fit_som(
 
     Returns:
         the fitted graph, and the quantisation error (mean distance from points to their nearest node, mm)
-        at ten even steps.
+        at about ten even steps and at the last epoch.
     """
     nodes = np.array(graph.nodes.T, order="C")
     points = cloud.points

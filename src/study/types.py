@@ -524,12 +524,13 @@ class Registration:
         source: (n, 3) mm, the CT points as given.
         warped: (n, 3) mm, row i is ``source[i]`` in the target (US) frame.
         T_us_ct: the rigid part: the whole answer of a rigid method, the coarse alignment of a non-rigid one.
-        converged: False when the iteration limit ended the run.
+        converged: False when the iteration limit ended the run; the skeleton graph has a fixed schedule and no test
+            of convergence, so there it only says that the schedule was run.
         n_iterations: iterations (epochs) run.
         stop_reason: why it stopped, in words.
-        history: one figure of progress per iteration; what it is depends on the method.
+        history: figures of progress, in order; what they are and how often depends on the method.
         seconds: wall time.
-        method: name in ``METHODS``.
+        method: name in ``METHODS`` from `register_pair`; the class's own name from `Method.register`.
         warnings: what a careful reader should know about this result.
     """
 
