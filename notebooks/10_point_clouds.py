@@ -146,7 +146,7 @@ if judged is None:
     print("only with dataset=open and profile=full")
 else:
     labelled, labels = people[judged], entries[judged].labels
-    ids = {structure: label for label, structure in manifest.label_map(labels.map).items()}
+    ids = manifest.label_ids(labels.map)
     grown = parts_from_ribs(labelled.image, read_labels(fetch(manifest.file(labels.file)), labelled.image), ids)
     grown_mesh = surface(grown)
 

@@ -47,7 +47,7 @@ _ct_volume = phantom.ct_volume
 
 
 def structure_ids() -> dict[str, int]:
-    return {name: label for label, name in load_manifest().label_map("totalsegmentator_v2").items()}
+    return load_manifest().label_ids("totalsegmentator_v2")
 
 
 def ribseg_labels(labels: Volume) -> Volume:

@@ -11,13 +11,14 @@ import yaml
 
 from study.cartilage_growth import parts_from_landmarks, parts_from_ribs, rib_ends
 from study.chest_wall import anterior_wall_image
-from study.ct import LABEL_MAPS, rib_name
+from study.ct import rib_name
 from study.data.landmarks import Landmarks, read_landmarks
+from study.data.manifest import load_manifest
 from study.errors import StudyError
 from study.types import CARTILAGES, Part, RigidTransform, Volume
 
 ROOT = Path(__file__).parents[1]
-IDS = LABEL_MAPS["ribseg"]
+IDS = load_manifest().label_ids("ribseg_v2")
 SPACING = np.array([1.4, 1.4, 2.0])
 SHAPE = (150, 90, 84)
 FRAME = RigidTransform(translation=np.array([-105.0, -85.0, -85.0]))

@@ -195,7 +195,7 @@ def test_a_ct_of_ones_own_needs_labels_or_landmarks_and_labels_that_hold_the_rib
     one_side = ribseg_labels(labels)
     one_side = replace(one_side, values=np.where(one_side.values > 12, 0, one_side.values))
     ribs = nifti(one_side, tmp_path / "ribs.nii.gz")
-    ids = {name: label for label, name in load_manifest().label_map("ribseg_v2").items()}
+    ids = load_manifest().label_ids("ribseg_v2")
     with pytest.raises(StudyError, match="none of rib_left_2, rib_left_3, rib_left_4, rib_left_5"):
         read_anatomy(ct, 2000, rng, labels=ribs, ids=ids)
     # The same without a word on how to read them.

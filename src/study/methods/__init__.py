@@ -12,7 +12,7 @@ from study.methods.visible_surface import VisibleSurface
 from study.types import Method
 
 # As published or as the library ships it; then tuned, with parameters found on development subjects by
-# benchmarks/tune.py. On those subjects the visible half of the tubes gave every method the smaller waypoint error.
+# tools/tune.py. On those subjects the visible half of the tubes gave every method the smaller waypoint error.
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
         "coarse": CoarseOnly(),

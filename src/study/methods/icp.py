@@ -45,7 +45,7 @@ class Icp:
 
     @classmethod
     def tuned(cls) -> Icp:
-        """The best row of ``results/tuning/icp.csv``, found on development subjects by benchmarks/tune.py."""
+        """The best row of ``results/tuning/icp.csv``, found on development subjects by tools/tune.py."""
         return cls(max_distance_mm=7.0, max_iterations=200)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:

@@ -68,7 +68,7 @@ class NonrigidIcp:
 
     @classmethod
     def tuned(cls) -> NonrigidIcp:
-        """The best row of ``results/tuning/nonrigid_icp.csv`` (benchmarks/tune.py): the library's defaults.
+        """The best row of ``results/tuning/nonrigid_icp.csv`` (tools/tune.py): the library's defaults.
 
         No schedule, stiffness, ``gamma`` or threshold of the grid beat them on the development subjects.
         """

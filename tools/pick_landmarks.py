@@ -1,9 +1,9 @@
 """Pictures that show where to look for the landmarks of a CT, and the millimetres of what was picked.
 
-    python benchmarks/pick_landmarks.py CT --out pictures/                       front.png and a grid to read x, z from
-    python benchmarks/pick_landmarks.py CT --out pictures/ --slices -120 -125    those axial slices, to read x, y from
-    python benchmarks/pick_landmarks.py CT --pick 33.5 -85.6                     the 3-D point under a pick
-    python benchmarks/pick_landmarks.py CT --out pictures/ --check FILE.yaml     its points, and what grows from them
+    python tools/pick_landmarks.py CT --out pictures/                       front.png and a grid to read x, z from
+    python tools/pick_landmarks.py CT --out pictures/ --slices -120 -125    those axial slices, to read x, y from
+    python tools/pick_landmarks.py CT --pick 33.5 -85.6                     the 3-D point under a pick
+    python tools/pick_landmarks.py CT --out pictures/ --check FILE.yaml     its points, and what grows from them
 
 Read x and z from the front view, refine x and y in the axial slice at that z, write `annotations/<subject>.yaml`,
 and look at `check-*.png`: green crosses must lie in the middle of each cartilage's ends, red outlines on cartilage.

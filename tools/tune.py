@@ -1,6 +1,6 @@
 """Tune every method on development subjects: every grid row on every case, one table a method.
 
-    python benchmarks/tune.py [icp nonrigid_icp cpd skeleton_graph visible_surface] [--out results/tuning]
+    python tools/tune.py [icp nonrigid_icp cpd skeleton_graph visible_surface] [--out results/tuning]
 
 The development subjects are phantoms of cohort seeds that the study does not report. Each pair starts from the coarse
 alignment, as in the study. The best row has the smallest mean true waypoint error in the feature plane: the study's own
