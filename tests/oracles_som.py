@@ -45,7 +45,7 @@ def som_literal(graph: SkeletonGraph, points: Floats, params: SomParams, rng: np
         for k in rng.integers(len(points), size=params.samples):
             winner = min(range(n), key=lambda s: float(((points[k] - nodes[s]) ** 2).sum()))
             for s in range(n):
-                if hops[winner, s] < n:
+                if hops[winner, s] <= radius and hops[winner, s] < n:
                     theta = np.exp(-(hops[winner, s] ** 2) / (2 * radius**2))
                     nodes[s] = nodes[s] + theta * rate * (points[k] - nodes[s])
     return np.array(nodes)

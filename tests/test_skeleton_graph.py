@@ -60,6 +60,16 @@ def test_the_maps_close_on_their_clouds(pair):
     assert result.stop_reason
 
 
+def test_a_schedule_that_ends_too_early_has_not_converged(pair):
+    rng = np.random.default_rng
+    assert SkeletonGraphMethod().register(*pair, rng(0)).converged
+    short = replace(SomParams(), epochs=8, samples=50)
+    for early in (SkeletonGraphMethod(ct_som=short), SkeletonGraphMethod(us_som=short)):
+        result = early.register(*pair, rng(0))
+        assert not result.converged
+        assert "fell by" in result.stop_reason
+
+
 def test_a_source_without_labels_or_with_a_part_missing_is_refused(pair):
     source, target = pair
     rng = np.random.default_rng(0)

@@ -36,6 +36,7 @@ def test_the_defaults_are_the_papers():
     assert (params.rate, params.rate_schedule) == (0.1, "constant")
     assert (params.pretrain_epochs, params.pretrain_rate) == (3, 0.02)
     assert params.winners == "any"
+    assert params.radius == 5  # the authors' code; the paper has none
 
 
 def test_the_authors_rate_compounds():
@@ -71,12 +72,13 @@ def test_the_authors_radius_falls_from_5_to_4_after_one_epoch_and_ends_at_1():
     assert radii == [int((5 - 1) * (1 - epoch / 5000)) + 1 for epoch in range(5000)]
 
 
-def test_the_neighbourhood_is_a_gaussian_of_hops_and_nothing_where_no_path_leads():
+def test_the_neighbourhood_is_a_gaussian_of_hops_that_ends_at_the_radius():
     hops = np.array([[0, 1, 3], [1, 0, 2], [3, 3, 0]])
     theta = neighbourhood(hops, 2.0)
     assert theta[0, 1] == pytest.approx(np.exp(-1 / 8))
     assert theta[1, 2] == pytest.approx(np.exp(-4 / 8))
-    assert theta[2].tolist() == [0, 0, 1]
+    assert theta[2].tolist() == [0, 0, 1]  # no path leads there
+    assert theta[0].tolist() == [1, pytest.approx(np.exp(-1 / 8)), 0]  # 3 hops are beyond 2
 
 
 def column_of_three(one_way: bool) -> SkeletonGraph:

@@ -15,6 +15,9 @@ from study.types import Floats, Ints, Part, PointCloud, SkeletonGraph
 RateSchedule = Literal["constant", "linear", "compounding"]
 Winners = Literal["any", "own_part"]
 
+N_CHECKS = 20  # of the quantisation error along the schedule
+MAX_FALL = 0.02  # of it over the last two checks of a map at rest; the draws of a constant rate alone make 1 %
+
 
 @dataclass(frozen=True)
 class SomParams:
@@ -25,7 +28,8 @@ class SomParams:
         samples: points drawn per epoch.
         rate: learning rate l_r of the main epochs (0.1 in the paper).
         rate_schedule: ``"constant"`` (the paper), ``"linear"`` to 0, or ``"compounding"`` (the authors' code).
-        radius: start of the neighbourhood radius in hops; it falls to 1. The paper states none.
+        radius: start of the neighbourhood radius in hops; it falls to 1 (`radius_at`). The paper states none; 5 is the
+            authors' code's.
         winners: ``"any"`` node may win a point (the paper); ``"own_part"`` only those of the point's labelled part.
         pretrain_epochs, pretrain_rate: epochs on the directed graph (3 at 0.02 in the paper).
     """
@@ -34,7 +38,7 @@ class SomParams:
     samples: int = 500
     rate: float = 0.1
     rate_schedule: RateSchedule = "constant"
-    radius: float = 3.0
+    radius: float = 5.0
     winners: Winners = "any"
     pretrain_epochs: int = 3
     pretrain_rate: float = 0.02
@@ -66,9 +70,13 @@ class SomParams:
 
 
 def neighbourhood(hops: Ints, radius: float) -> Floats:
-    """theta of Eq. 2: (m, m), row = winner; ``exp(-hops² / (2 radius²))``, 0 where no path leads."""
-    theta = np.exp(-(hops.astype(np.float64) ** 2) / (2 * radius**2))
-    return np.where(hops >= len(hops), 0.0, theta)
+    """theta of Eq. 2: (m, m), row = winner; ``exp(-hops² / (2 radius²))`` within ``radius`` hops, 0 beyond.
+
+    The paper calls it a restriction function; as in its authors' code it ends at the radius. Without that end a winner
+    drags nodes of the neighbouring branches along, and branches swap.
+    """
+    reached = (hops <= radius) & (hops < len(hops))  # pairs without a path have len(hops)
+    return np.where(reached, np.exp(-(hops.astype(np.float64) ** 2) / (2 * radius**2)), 0.0)
 
 
 @njit(cache=True)
@@ -109,7 +117,7 @@ def fit_som(
 
     Returns:
         the fitted graph, and the quantisation error (mean distance from points to their nearest node, mm)
-        at about ten even steps and at the last epoch.
+        at ``N_CHECKS`` even steps (every epoch of a shorter schedule) and at the last epoch.
     """
     nodes = np.array(graph.nodes.T, order="C")
     points = cloud.points
@@ -129,9 +137,18 @@ def fit_som(
             radius = params.radius_at(epoch)
             theta = neighbourhood(undirected, radius)
         train(theta, params.rate_at(epoch))
-        if epoch % max(1, params.epochs // 10) == 0 or epoch == params.epochs - 1:
+        if epoch % max(1, params.epochs // N_CHECKS) == 0 or epoch == params.epochs - 1:
             history.append(quantisation_error_mm(nodes.T, points))
     return graph.with_nodes(nodes.T), tuple(history)
+
+
+def late_fall(history: tuple[float, ...]) -> float:
+    """Share by which the quantisation error still fell from the third last check of `fit_som` to the last.
+
+    A map at rest has less than ``MAX_FALL``. The schedule's length is fixed, so this is the test of convergence: one
+    too short ends while its error falls, whatever its rate.
+    """
+    return 1 - history[-1] / history[-3] if len(history) >= 3 else 1.0
 
 
 def _barred(graph: SkeletonGraph, cloud: PointCloud, winners: Winners) -> tuple[Ints, Floats]:

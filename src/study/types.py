@@ -524,8 +524,7 @@ class Registration:
         source: (n, 3) mm, the CT points as given.
         warped: (n, 3) mm, row i is ``source[i]`` in the target (US) frame.
         T_us_ct: the rigid part: the whole answer of a rigid method, the coarse alignment of a non-rigid one.
-        converged: False when the iteration limit ended the run; the skeleton graph has a fixed schedule and no test
-            of convergence, so there it only says that the schedule was run.
+        converged: False when the iteration limit or the end of a schedule came before the method was at rest.
         n_iterations: iterations (epochs) run.
         stop_reason: why it stopped, in words.
         history: figures of progress, in order; what they are and how often depends on the method.

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from study.coarse import chest_frame
-from study.som import SomParams, fit_som, quantisation_error_mm
+from study.som import MAX_FALL, SomParams, fit_som, late_fall, quantisation_error_mm
 from study.template import template_graph
 from study.types import PointCloud, Registration, RigidTransform
 from study.warp import BlendWeights, Neighbours, blend, local_transforms
@@ -45,6 +45,9 @@ class SkeletonGraphMethod:
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Register labelled, coarsely aligned clouds.
 
+        ``history`` is the quantisation error of the CT map, then of the US map, mm; converged means that neither fell
+        any more when its schedule ended (`study.som.late_fall`).
+
         Raises:
             StudyError: a part of the source is missing.
         """
@@ -54,14 +57,15 @@ class SkeletonGraphMethod:
         g_us, us_history = fit_som(g_ct, target, self.us_som, rng)
         hops = g_ct.hops(directed=False)
         rotations, translations = local_transforms(g_ct.nodes, g_us.nodes, hops, self.n_reg, self.neighbours)
+        falls = late_fall(ct_history), late_fall(us_history)
         warped = blend(source.points, g_ct.nodes, rotations, translations, self.blend_k, self.blend_weights)
         return Registration(
             source=source.points,
             warped=warped,
             T_us_ct=RigidTransform(),
-            converged=True,
+            converged=max(falls) < MAX_FALL,
             n_iterations=self.ct_som.epochs + self.us_som.epochs,
-            stop_reason="both maps ran their schedule",
+            stop_reason="both maps ran their schedule; at its end their errors fell by {:.1%} and {:.1%}".format(*falls),
             history=(*ct_history, *us_history),
             seconds=time.perf_counter() - start,
             method=self.name,
