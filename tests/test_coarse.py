@@ -89,7 +89,7 @@ def test_a_missing_part_is_an_error(name, part, ct_clouds, us_cloud):
 def test_branches_that_face_gaps_are_refused(ct_clouds):
     cloud = ct_clouds["ct5"]
     torn = PointCloud(cloud.points[cloud.parts != Part.RIGHT_5], "torn")
-    with pytest.raises(StudyError, match=r"four cartilages a side that leave the sternum in pairs.* mm; is a branch"):
+    with pytest.raises(StudyError, match=r"expected (four|4 separate) cartilages .*; is a branch missing"):
         find_chest(torn)
 
 
@@ -116,7 +116,7 @@ def test_the_template_frame_is_measured_from_the_parts(ct_clouds):
         frame = chest_frame(cloud)
         assert frame.left == pytest.approx([-1, 0, 0], abs=0.35)
         assert np.cross(frame.left, frame.up) == pytest.approx(frame.front, abs=1e-9)
-        assert 25 < frame.width_mm < 60
+        assert 20 < frame.width_mm < 40
         for side in ("right", "left"):
             roots = [frame.root_mm[Part.cartilage(side, level)] for level in (2, 3, 4, 5)]
             assert roots == sorted(roots, reverse=True)

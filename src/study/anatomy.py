@@ -24,7 +24,8 @@ def measure_anatomy(ct: Volume, mask: Volume, subject: str) -> pd.DataFrame:
     Lengths follow the middle line from end to end. Width (in the chest wall) and thickness (through it) are those
     of the ellipse, for the sternum of the rectangle, with the cross-section's spread: the median over the middle
     80 % of the length. Curvature is the mean of the middle line's, the bend the angle between its ends' directions.
-    The sternum's length is that of the region of interest, from the 2nd to the 5th cartilages.
+    The sternum's length is that of the region of interest, from the 2nd to the 5th cartilages. The wall's curvature is
+    that of the front across: of the parabola through all cartilages, from side to side.
 
     Args:
         ct: Hounsfield units.
@@ -52,6 +53,9 @@ def measure_anatomy(ct: Volume, mask: Volume, subject: str) -> pd.DataFrame:
         if part is not Part.STERNUM:
             rows += [(subject, name, *row) for row in _densities(ct, mask, [part], subject)]
     rows += [(subject, "cartilages", *row) for row in _densities(ct, mask, list(CARTILAGES), subject)]
+    cartilages = np.vstack([points[part] for part in CARTILAGES])
+    curvature = _wall_curvature(cartilages, points[Part.STERNUM].mean(axis=0))
+    rows.append((subject, "cartilages", "wall_curvature", curvature, "1/m"))
     return pd.DataFrame(rows, columns=["subject", "part", "quantity", "value", "unit"])
 
 
@@ -59,6 +63,13 @@ def _front(points: Floats) -> Floats:
     """Unit normal (3,) of the sheet the cartilages lie in, to the front."""
     normal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
     return normal * np.sign(normal[1])
+
+
+def _wall_curvature(points: Floats, middle: Floats) -> float:
+    """Curvature (1/m) across the chest of points (n, 3) mm, RAS+, about the middle of the sternum (3,)."""
+    x, y, z = (points - middle).T
+    fit = np.linalg.lstsq(np.column_stack([np.ones_like(x), x, z, x * x]), y, rcond=None)[0]
+    return float(-2000.0 * fit[3])
 
 
 def _tube_sizes(points: Floats, front: Floats, diameter_per_sd: float) -> dict[str, tuple[float, str]]:

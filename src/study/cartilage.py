@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -17,6 +17,8 @@ from study.types import Bools, Floats, Ints
 
 PIXEL_MM = 1.0
 BANDS_MM = ((2.0, 14.0), (6.0, 18.0), (10.0, 22.0), (14.0, 26.0), (2.0, 26.0))  # outwards from the sternum's edge
+MIN_SPACE_MM = 4.0  # between neighbouring cartilages beside the sternum; they are 8 mm and more apart
+MAX_OFFSET_MM = 15.0  # along the sternum between the two roots of a level; a missing branch shifts by a level, 20-35
 GAP_COST = 3.0  # of crossing an empty pixel, against 1 along a cartilage
 MAX_GAP_MM = 20.0  # a piece farther than this from every branch belongs to none
 
@@ -77,10 +79,15 @@ def find_branches(points: Floats, height_mm: float, name: str = "cloud") -> Bran
     x = np.arange(image.shape[0])[:, None] * PIXEL_MM + origin[0]
     edges = (sternum_edge_mm(points, height_mm, -1), sternum_edge_mm(points, height_mm, 1))
     sternum = (x >= -edges[0]) & (x <= edges[1])
-    seeds = [
+    left, right = (
         _seeds(image, sign * x - edge, side, name) for side, (sign, edge) in enumerate(zip((-1, 1), edges, strict=True))
-    ]
-    starts = np.concatenate(seeds)
+    )
+    # The roots of a level face each other. Where a strip was missed beside the sternum on one side, they do so only in
+    # bands farther out: the nearest pair of bands that fits, else the one that fits best.
+    pairs = sorted(product(range(len(left)), range(len(right))), key=sum)
+    offsets = [float(np.abs(left[i][:, 1] - right[j][:, 1]).max() * PIXEL_MM) for i, j in pairs]
+    chosen = next((k for k, offset in enumerate(offsets) if offset <= MAX_OFFSET_MM), int(np.argmin(offsets)))
+    starts = np.concatenate([left[pairs[chosen][0]], right[pairs[chosen][1]]])
     flooded = _flood(image, np.broadcast_to(sternum, image.shape), starts.astype(np.int64))
     branch = flooded[pixels[:, 0], pixels[:, 1]]
     return Branches(branch, edges, starts * PIXEL_MM + origin)
@@ -113,25 +120,36 @@ def _flood(image: Bools, sternum: Bools, starts: Ints) -> Ints:
     return np.where(sternum, 0, branch).astype(np.int64)
 
 
-def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> Floats:
-    """Four cluster centres beside the sternum (k-means), each snapped to a pixel of its cluster, by rising y.
+def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> list[Floats]:
+    """Four cluster centres (4, 2) beside the sternum (k-means), each snapped to a pixel of its cluster, by rising y.
 
-    The roots of neighbours may touch and a sweep may miss a strip, so the search moves outwards until no two centres
-    lie on one cartilage.
+    The roots of neighbours may touch and a sweep may miss a strip, so the search moves outwards; the answers of every
+    band in which no two centres lie on one cartilage.
     """
     where = ("left", "right")[side]
+    found = []
     for near, far in BANDS_MM:
         candidates = np.argwhere(image & (outwards_mm >= near) & (outwards_mm <= far))
         if len(candidates) < 8:
             continue
-        quarters = np.array_split(candidates[np.argsort(candidates[:, 1], kind="stable")], 4)
-        clusters = KMeans(n_clusters=4, init=np.array([quarter.mean(axis=0) for quarter in quarters])).fit(candidates)
-        seeds = []
-        for k in np.argsort(clusters.cluster_centers_[:, 1]):
-            members = candidates[clusters.labels_ == k]
-            seeds.append(members[np.argmin(np.linalg.norm(members - clusters.cluster_centers_[k], axis=1))])
-        if not any(_joined(image, lower, upper) for lower, upper in pairwise(seeds)):
-            return np.array(seeds, dtype=np.float64)
+        candidates = candidates[np.argsort(candidates[:, 1], kind="stable")]
+        starts = [np.array_split(candidates, 4)]
+        # A strip may have left little of one cartilage: quarters of the pixels then start on the wrong ones, pieces
+        # between clear gaps do not.
+        gaps = np.flatnonzero(np.diff(candidates[:, 1]) * PIXEL_MM >= MIN_SPACE_MM) + 1
+        if len(gaps) == 3:
+            starts.append(np.split(candidates, gaps))
+        for pieces in starts:
+            start = np.array([piece.mean(axis=0) for piece in pieces])
+            clusters = KMeans(n_clusters=4, init=start).fit(candidates)
+            seeds = []
+            for k in np.argsort(clusters.cluster_centers_[:, 1]):
+                members = candidates[clusters.labels_ == k]
+                seeds.append(members[np.argmin(np.linalg.norm(members - clusters.cluster_centers_[k], axis=1))])
+            if not any(_joined(image, lower, upper) for lower, upper in pairwise(seeds)):
+                found.append(np.array(seeds, dtype=np.float64))
+    if found:
+        return found
     raise StudyError(
         f"{name}: expected 4 separate cartilages at the {where} of the sternum as seen from one face, got fewer; "
         "is a branch missing, or do two touch along their length?"

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from study.cartilage import Branches, find_branches
+from study.cartilage import MAX_OFFSET_MM, Branches, find_branches
 from study.errors import StudyError
+from study.geometry import nearest
 from study.sternum import SternumFit, SternumParams, feature_plane, sternum_candidates, symmetry_axis
 from study.types import CARTILAGES, ChestFrame, Floats, Part, PointCloud, RigidTransform
 
 MIN_BULGE_MM = 0.2
-MIN_BEND_RATIO = 1.8  # sound clouds reach 3 and more; a sweep whose lines are shifted against each other falls to 1
-# What tells eight cartilages from eight pieces of something else; on whole chests 9 or less, 18 or more, 24 or more.
-MAX_OFFSET_MM = 15.0  # along the sternum between the two roots of a level; a missing branch shifts by a level, 20-35
+MIN_BEND_RATIO = 1.8  # sound clouds have 3 and more; where strips cut ends off it falls to 1.1, and is wrong
+# What tells eight cartilages from eight pieces of something else. On 251 whole clouds of development and real people:
+# offset 11 or less, apart 14 or more, length 15 or more, touch 0.21 or less, fill 0.47 or less.
 MIN_APART_MM = 12.0  # between the roots of neighbours
 MIN_LENGTH_MM = 15.0  # beside the sternum
-MAX_FILL = 0.6  # density of points between neighbours over that on them: a plate has 0.85 or more, a chest 0.3 or less
+BESIDE_MM = 20.0  # from the sternum's edge: where neighbours that are two cartilages are apart
+TOUCH_MM = 4.0
+MAX_TOUCH = 0.3  # share of a root that close to its neighbour; two halves of one cartilage have 0.38 or more
+MAX_FILL = 0.6  # density of points between neighbours over that on them; a plate has 0.85 or more
 
 
 @dataclass(frozen=True)
@@ -165,6 +170,17 @@ def _check_branches(branches: Branches, local: Floats, name: str) -> None:
             f"least {MIN_APART_MM:g} mm apart and {MIN_LENGTH_MM:g} mm long, got {offset:.0f}, {apart:.0f} and "
             f"{min(lengths):.0f} mm; is a branch missing, or does the cloud hold more than cartilages 2-5?"
         )
+    beside_sternum = (local[:, 0] > -branches.half_widths_mm[0] - BESIDE_MM) & (
+        local[:, 0] < branches.half_widths_mm[1] + BESIDE_MM
+    )
+    roots_of = [local[(branches.branch == k) & beside_sternum] for k in range(1, 9)]
+    neighbours = [pair for side in (roots_of[:4], roots_of[4:]) for pair in pairwise(side)]
+    touch = max(max(_share_near(one, other), _share_near(other, one)) for one, other in neighbours)
+    if touch > MAX_TOUCH:
+        raise StudyError(
+            f"{name}: expected cartilages apart from their neighbours beside the sternum, got {touch:.2f} of one within "
+            f"{TOUCH_MM:g} mm of the next, need {MAX_TOUCH:g} or less; is a branch missing?"
+        )
     seeds = branches.seeds.reshape(2, 4, 2)
     between = (seeds[:, :-1] + seeds[:, 1:]) / 2
     fill = _count_near(local, between).mean() / max(_count_near(local, seeds).mean(), 1e-9)
@@ -173,6 +189,11 @@ def _check_branches(branches: Branches, local: Floats, name: str) -> None:
             f"{name}: expected open spaces between the cartilages, got {fill:.2f} of their own density there, "
             f"need {MAX_FILL:g} or less; crop to sternum and cartilages of ribs 2-5"
         )
+
+
+def _share_near(one: Floats, other: Floats) -> float:
+    """Share of the points ``one`` (n, 2) that lie within ``TOUCH_MM`` of ``other`` (m, 2); 0 where one is empty."""
+    return float((nearest(one, other)[0] < TOUCH_MM).mean()) if len(one) and len(other) else 0.0
 
 
 def _count_near(local: Floats, places: Floats) -> Floats:

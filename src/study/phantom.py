@@ -35,32 +35,42 @@ MANUBRIUM_MM = ((46.7, 5.1), (51.2, 6.0))
 BODY_MM = ((86.6, 9.7), (102.4, 13.3))
 CARTILAGE_MM = {4: (55.8, 9.8), 5: (70.0, 10.8)}
 STERNAL_ANGLE_DEG = 163.0
+# What no publication gives, measured on the four people of the open cohort (results/anatomy.csv, mean and population SD
+# over people of the mean of both sides).
+MEASURED_LENGTH_MM = {2: (40.1, 7.0), 3: (47.2, 3.8)}
+MEASURED_WIDTH_MM = {2: 10.6, 3: 11.7, 4: 12.0, 5: 12.3}
+MEASURED_THICKNESS_MM = (8.6, 1.15)  # of all eight cartilages
+MEASURED_STERNUM_MM = ((24.0, 2.2), 10.7)  # width and its SD, thickness
+MEASURED_HU = (101.7, 5.0)
+# Curvature across the front, 1/m: the upper part of the -0.8 to 6.3 measured. Whether the flattest are seen from the
+# front or from behind, nothing in a cloud could tell.
+WALL_PER_M = (4.3, 1.5)
 MAX_SD = 1.3  # draws are cut there: different people, no outliers
 
 # The canonical course of the right side's cartilages and ribs on the flat wall, x and z in mm, z = 0 at the sternal
 # angle; the cartilage takes the first `length` mm from the edge of the sternum, bone follows.
 _COURSES: Mapping[int, tuple[float, tuple[tuple[float, float], ...]]] = {
-    1: (28.0, ((20, 34), (34, 37), (48, 44), (62, 57), (74, 72))),
-    2: (40.0, ((12, 0), (32, 1), (54, 5), (78, 17), (102, 36), (122, 54))),
-    3: (47.0, ((12, -28), (36, -30), (60, -28), (86, -14), (112, 8), (134, 28))),
-    4: (56.0, ((12, -52), (34, -59), (54, -62), (72, -58), (98, -40), (124, -16), (144, 4))),
-    5: (70.0, ((12, -73), (32, -84), (50, -95), (66, -100), (80, -97), (104, -82), (130, -57), (148, -39))),
-    6: (92.0, ((12, -90), (26, -102), (44, -116), (62, -127), (80, -133), (94, -131), (118, -116), (146, -89))),
+    1: (28.0, ((16, 34), (34, 37), (48, 44), (62, 57), (74, 72))),
+    2: (40.0, ((8, 0), (32, 1), (54, 5), (78, 17), (102, 36), (122, 54))),
+    3: (47.0, ((8, -28), (36, -30), (60, -28), (86, -14), (112, 8), (134, 28))),
+    4: (56.0, ((8, -51), (34, -59), (54, -62), (72, -58), (98, -40), (124, -16), (144, 4))),
+    5: (70.0, ((8, -71), (32, -84), (50, -95), (66, -100), (80, -97), (104, -82), (130, -57), (148, -39))),
+    6: (92.0, ((8, -88), (26, -102), (44, -116), (62, -127), (80, -133), (94, -131), (118, -116), (146, -89))),
     7: (125.0, ((8, -98), (18, -111), (34, -130), (58, -152), (84, -166), (102, -167), (126, -154), (148, -135))),
     8: (45.0, ((68, -159), (82, -177), (100, -189), (116, -191), (140, -177))),
 }
 # Bridges between neighbours: the 5th and 6th meet well beside the sternum, the 8th ends on the 7th.
 _BRIDGES = (((58, -98), (60, -126)), ((66, -129), (68, -157)))
-_HALF_WIDTH_MM = {1: 8.0, 2: 7.5, 3: 7.2, 4: 7.2, 5: 7.2, 6: 6.2, 7: 6.0, 8: 5.5}
-_HALF_THICKNESS_MM = 5.0
+_HALF_WIDTH_MM = {1: 7.0, **{level: width / 2 for level, width in MEASURED_WIDTH_MM.items()}, 6: 6.0, 7: 6.0, 8: 5.5}
+_HALF_THICKNESS_MM = MEASURED_THICKNESS_MM[0] / 2
 _RIB_HALF_MM = (6.5, 4.0)
 _BRIDGE_HALF_MM = (5.0, 4.0)
 
 # Sternum outline: half width over z, from the xiphoid's tip to the jugular notch.
 _STERNUM_Z = (-128, -120, -108, -99, -92, -78, -62, -45, -28, -12, 0, 10, 22, 36, 45, 49)
-_STERNUM_HALF_WIDTH = (3, 5.5, 7, 9, 13, 16.5, 17, 16.5, 15, 14.5, 15.5, 16.5, 20, 25, 24, 20)
+_STERNUM_HALF_WIDTH = (3, 5.5, 7, 8, 10.5, 13, 13.5, 13, 12, 11.5, 12, 13.5, 17, 24, 23, 19)
 _STERNUM_TOP, _STERNUM_BOTTOM, _BODY_BOTTOM = 49.0, -128.0, -95.0
-_STERNUM_HALF_THICKNESS_MM = 6.0
+_STERNUM_HALF_THICKNESS_MM = MEASURED_STERNUM_MM[1] / 2
 _EDGE_RADIUS_MM = 3.0
 
 # Canonical, mm: the deformations must be invertible in all of ROI, and a CT shows all of VIEW.
@@ -275,8 +285,9 @@ def _surface() -> _Surface:
 def draw_subject(name: str, seed: int) -> Subject:
     """Draw a subject of the cohort; the same ``name`` and ``seed`` give the same person.
 
-    Lengths of manubrium, body and the 4th and 5th cartilage are drawn from the published means and SDs, cut at 1.3 of
-    them; the other lengths share their stretch.
+    Lengths of manubrium, body and the 4th and 5th cartilage are drawn from published means and SDs; lengths of the 2nd
+    and 3rd, thickness, the sternum's width and the cartilage's density from those measured on the open cohort; all cut
+    at 1.3 SD, the wall's curvature from the upper part of the measured range.
 
     Raises:
         StudyError: a name that is not in `SUBJECTS`.
@@ -295,12 +306,12 @@ def draw_subject(name: str, seed: int) -> Subject:
         *_flat_stretch(
             manubrium=normal(*MANUBRIUM_MM[sex]) / _STERNUM_TOP * np.cos(np.radians(lean_deg)),
             body=normal(*BODY_MM[sex]) / -_BODY_BOTTOM,
-            width=normal(0.96 + 0.08 * sex, 0.06),
-            thickness=normal(1.0, 0.06),
+            width=normal(1.0, MEASURED_STERNUM_MM[0][1] / MEASURED_STERNUM_MM[0][0]),
+            thickness=normal(1.0, MEASURED_THICKNESS_MM[1] / MEASURED_THICKNESS_MM[0]),
             rng=rng,
         ),
         *rib_bending(middle, np.array([2.0, -29.0, -60.0, -97.0]), 2.2, 14.0, rng),
-        Roll(normal(125.0, 8.0), normal(2.0e-3, 4e-4)),
+        Roll(1000.0 / normal(*WALL_PER_M), normal(2.0e-3, 4e-4)),
         # The manubrium leans back by what the sternal angle lacks to 180 degrees.
         Ramp(1, 2, -float(np.tan(np.radians(lean_deg))), 0.0, 3.0),
         _bend(normal(0.0, 3.0), normal(1.5, 2.5)),
@@ -309,25 +320,26 @@ def draw_subject(name: str, seed: int) -> Subject:
         *breathing(middle, rng),
         Affine.motion(rng.normal(scale=2.0, size=3), rng.normal(scale=10.0, size=3), middle),
     )
-    return Subject(name, seed, Deformation(steps), fat_mm=normal(10.0, 2.5), cartilage_hu=normal(140.0, 12.0))
+    return Subject(name, seed, Deformation(steps), fat_mm=normal(10.0, 2.5), cartilage_hu=normal(*MEASURED_HU))
 
 
 def _flat_stretch(
     manubrium: float, body: float, width: float, thickness: float, rng: np.random.Generator
 ) -> tuple[Affine | Ramp | Bumps, ...]:
     """Stretch of the flat wall: sternum by part, then cartilages by side and level; factors of the canonical size."""
-    # The 4th and 5th cartilage of one person go together (correlation 0.8), the sides nearly so.
-    z4, other = np.clip(rng.normal(size=2), -MAX_SD, MAX_SD)
-    z5 = float(np.clip(0.8 * z4 + 0.6 * other, -MAX_SD, MAX_SD))
-    (mean4, sd4), (mean5, sd5) = CARTILAGE_MM[4], CARTILAGE_MM[5]
-    length4, length5 = (mean4 + sd4 * z4) / _COURSES[4][0], (mean5 + sd5 * z5) / _COURSES[5][0]
-    common = (length4 + length5) / 2
+    # The cartilages of one person go together (correlation 0.8), the sides nearly so.
+    z4 = float(np.clip(rng.normal(), -MAX_SD, MAX_SD))
+    lengths = []
+    for level, (mean, sd) in sorted((MEASURED_LENGTH_MM | CARTILAGE_MM).items()):
+        own = 0.8 * z4 + 0.6 * float(np.clip(rng.normal(), -MAX_SD, MAX_SD))
+        lengths.append(mean + sd * float(np.clip(z4 if level == 4 else own, -MAX_SD, MAX_SD)))
+    canonical = np.array([_COURSES[level][0] for level in (2, 3, 4, 5)])
+    common = float((lengths / canonical).mean())
     sides = common / width * (1 + 0.02 * np.clip(rng.normal(size=2), -MAX_SD, MAX_SD)) - 1
-    edge = 17.0 * width
+    edge = 13.5 * width
     # What is left of each level's own length is a push along it, centred where its cartilage ends.
-    upper = 2.0 * np.clip(rng.normal(size=2), -MAX_SD, MAX_SD)
-    push = [*upper, _COURSES[4][0] * (length4 - common), _COURSES[5][0] * (length5 - common)]
-    ends = edge + common * np.array([_COURSES[level][0] * 0.95 for level in (2, 3, 4, 5)])
+    push = lengths - canonical * common
+    ends = edge + common * canonical * 0.95
     heights_z = body * np.array([3.0, -29.0, -60.0, -98.0])
     pushes = [
         Bumps.one(0, (side * x, 0, z), (20.0, np.inf, 13.0), side * np.clip(h, -8, 8))

@@ -31,7 +31,7 @@ class SternumParams:
     scales_mm: tuple[float, ...] = (5.0, 3.0, 2.0)
     ranges_deg: tuple[float, ...] = (15.0, 7.0)
     steps_deg: tuple[float, ...] = (10.0, 2.0, 1.0)
-    min_overlap: float = 0.8
+    min_overlap: float = 0.6
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def _alike(one: SternumFit, other: SternumFit, params: SternumParams) -> bool:
     return turn <= params.ranges_deg[0] / 2 and bool(np.linalg.norm(one.centre - other.centre) < params.width_mm / 2)
 
 
-def symmetry_axis(points: Floats, half_range_deg: float = 24.0, reach_mm: float = 55.0) -> tuple[float, float]:
+def symmetry_axis(points: Floats, half_range_deg: float = 40.0, reach_mm: float = 55.0) -> tuple[float, float]:
     """The line across which the view is most nearly its own mirror image.
 
     A rectangle covers a sternum shorter or wider than itself equally well at many angles; the chest's symmetry does
