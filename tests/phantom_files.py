@@ -12,29 +12,18 @@ import yaml
 from study import phantom
 from study.data.manifest import load_manifest
 from study.data.volumes import write_volume
-from study.deform import Deformation, Roll
 from study.params import PHANTOM_SEED, StudyParams
 from study.pipeline import named_rng
 from study.types import CARTILAGES, Part, Volume
 
 SPACING_MM = 2.5
-FLAT_RADIUS_MM = 300.0
 SMALL = StudyParams(ct_points=2000, us_spacing_mm=3.0, phantom_spacing_mm=SPACING_MM, max_sources=1, max_targets=1)
 
 
-def subject(name: str, *, flat: bool = False) -> phantom.Subject:
-    """A reported phantom; ``flat`` has its rib ends about level with the sternum, as most real chests do."""
-    drawn = phantom.draw_subject(name, PHANTOM_SEED)
-    if not flat:
-        return drawn
-    steps = [replace(s, radius_mm=FLAT_RADIUS_MM) if isinstance(s, Roll) else s for s in drawn.phi.steps]
-    return replace(drawn, phi=Deformation(tuple(steps)))
-
-
 @cache
-def scan(name: str, *, flat: bool = False) -> tuple[Volume, Volume]:
+def scan(name: str) -> tuple[Volume, Volume]:
     """The CT and its labels, as `study.cohorts.load_anatomy` draws them at `SPACING_MM`."""
-    return _ct_volume(subject(name, flat=flat), SPACING_MM, named_rng(PHANTOM_SEED, f"ct/{name}"))
+    return _ct_volume(phantom.draw_subject(name, PHANTOM_SEED), SPACING_MM, named_rng(PHANTOM_SEED, f"ct/{name}"))
 
 
 def cached_ct_volume(drawn: phantom.Subject, spacing_mm: float, _rng: np.random.Generator) -> tuple[Volume, Volume]:

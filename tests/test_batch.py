@@ -14,6 +14,7 @@ from study import batch, phantom
 from study.batch import Outcome, Workers, run_dataset, run_study, write_tables
 from study.cohorts import Anatomy, load_anatomy
 from study.errors import StudyError
+from study.metrics import TRUTH
 from study.results import FAILED, failed_row, metric_rows, read_metrics
 
 METHODS = ("coarse", "icp")
@@ -41,7 +42,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) -> None:
     run_study("phantom", SMALL, tmp_path, methods=reversed(METHODS), n_jobs=2)
     metrics = read_metrics(first / "metrics.csv")
-    assert len(metrics) == 2 * (3 + 3 + 4 * 20)  # methods x (distances, true errors, four kinds of 20 waypoints)
+    assert len(metrics) == 3 * (3 + 3 + 4 * 20)  # methods and truth x (distances, true errors, 4 kinds of 20 waypoints)
     assert set(metrics["status"]) <= {"ok", "not converged"}
     assert (tmp_path / "metrics.csv").read_bytes() == (first / "metrics.csv").read_bytes()
     assert (tmp_path / "hd_table.md").read_bytes() == (first / "hd_table.md").read_bytes()
@@ -50,9 +51,18 @@ def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) ->
 def test_one_method_alone_has_the_rows_it_has_among_others(first: Path) -> None:
     rows, _ = run_dataset("phantom", SMALL, methods=["icp", "icp"])
     among = read_metrics(first / "metrics.csv").query("method == 'icp'")
-    alone = pd.DataFrame(rows).sort_values(["metric", "index"])
+    alone = pd.DataFrame(rows).query("method == 'icp'").sort_values(["metric", "index"])
     assert len(alone) == len(among)
     assert alone["value"].to_list() == among.sort_values(["metric", "index"])["value"].to_list()
+
+
+def test_a_perfect_registration_is_measured_as_a_method_is(first: Path) -> None:
+    """Known points are exact, their path is carried by the sphere; the clouds still differ, tube against sheet."""
+    truth = read_metrics(first / "metrics.csv").query("method == @TRUTH").groupby("metric")["value"].max()
+    assert truth["true_error_max"] == 0
+    assert 0 < truth["true_waypoint_error"] < 5.0
+    assert truth["hd"] > 5.0
+    assert truth["waypoint_error"] > 1.0
 
 
 def test_another_seed_gives_other_numbers(first: Path) -> None:
@@ -70,7 +80,7 @@ def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
     assert " n " in (first / "hd_table.md").read_text(encoding="utf-8")
     timings = pd.read_csv(first / "timings.csv")
     assert timings["stage"].value_counts().to_dict() == {
-        "anatomy": 2, "sweep": 1, "coarse ct": 1, "coarse us": 1, "register": 2
+        "anatomy": 2, "sweep": 1, "coarse ct": 1, "coarse us": 1, "register": 3
     }  # fmt: skip
     provenance = json.loads((first / "provenance.json").read_text(encoding="utf-8"))
     assert provenance["parameters"]["study"]["ct_points"] == SMALL.ct_points
@@ -100,13 +110,13 @@ def test_a_subject_that_fails_is_rows_with_the_reason_and_the_rest_goes_on(
     run_study("phantom", TWO_CTS, tmp_path, methods=METHODS)
     metrics = read_metrics(tmp_path / "metrics.csv")
     failed = metrics[metrics["subject"] == "ct2"]
-    assert failed["method"].to_list() == list(METHODS)
+    assert failed["method"].to_list() == [*METHODS, TRUTH]
     assert set(failed["status"]) == {FAILED + "ct2: expected ribs, got a fish"}
     assert not metrics[metrics["subject"] == "ct1"]["status"].str.startswith(FAILED).any()
     table = pd.read_csv(tmp_path / "hd_table.csv")
     ours = table[table["data"] == "this study"].set_index("method")
-    assert ours["n"].to_list() == [1, 1]
-    assert ours["n_failed"].to_list() == [1, 1]
+    assert ours["n"].to_list() == [1, 1, 1]
+    assert ours["n_failed"].to_list() == [1, 1, 1]
     assert "1 failed" in (tmp_path / "hd_table.md").read_text(encoding="utf-8")
 
 
@@ -117,7 +127,7 @@ def test_a_patient_that_fails_takes_every_case_with_it_and_that_is_an_error(
     with pytest.raises(StudyError, match=r"phantom: every case failed: patient: expected ribs, got a fish$"):
         run_study("phantom", SMALL, tmp_path, methods=METHODS)
     metrics = read_metrics(tmp_path / "metrics.csv")
-    assert len(metrics) == 2
+    assert len(metrics) == 3
     assert metrics["status"].str.endswith("got a fish").all()
 
 
@@ -133,7 +143,7 @@ def test_a_method_that_fails_leaves_the_others(monkeypatch: pytest.MonkeyPatch) 
     rows, timings = run_dataset("phantom", SMALL, methods=METHODS)
     assert {row["method"] for row in rows if row["status"].startswith(FAILED)} == {"icp"}
     assert sum(row["method"] == "coarse" and row["status"] == "ok" for row in rows) > 80
-    assert [row["method"] for row in timings if row["stage"] == "register"] == ["coarse"]
+    assert [row["method"] for row in timings if row["stage"] == "register"] == ["coarse", TRUTH]
 
 
 def test_a_bug_is_no_failed_row(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,7 +173,7 @@ def test_the_planted_source_is_read_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
     def load(dataset: str, name: str, *rest: Any) -> Anatomy:
         read.append((dataset, name))
-        return replace(load_anatomy("phantom", "ct1", *rest), name=name)
+        return replace(load_anatomy("phantom", "ct3", *rest), name=name)
 
     monkeypatch.setattr(batch, "load_anatomy", load)
     monkeypatch.setattr(batch, "fetch_subject", lambda *_: None)

@@ -20,7 +20,7 @@ from http_archive import (
     ribseg_zip,
     totalsegmentator_zip,
 )
-from phantom_files import SMALL, cached_ct_volume, landmark_file, nifti, own_manifest, scan, structure_ids, subject
+from phantom_files import SMALL, cached_ct_volume, landmark_file, nifti, own_manifest, scan, structure_ids
 from scipy.spatial import KDTree
 
 from study import params as study_params
@@ -29,6 +29,7 @@ from study.cli import main
 from study.ct import parts_from_labels
 from study.data.clouds import read_ply, write_ply
 from study.methods import METHODS
+from study.params import PHANTOM_SEED
 from study.results import metric_rows, read_metrics, sha256_of, write_metrics
 from study.types import PointCloud, RigidTransform
 
@@ -56,9 +57,9 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A CT and a US cloud of two phantoms, each in a frame of its own, and waypoints of the CT."""
     folder = tmp_path_factory.mktemp("clouds")
     rng = np.random.default_rng(3)
-    ct = phantom.reference_cloud(subject("ct1"), 4000, rng)
-    us = phantom.anterior_cloud(subject("patient"), 3000, 0.5, 2, rng)
-    waypoints = phantom.waypoints(subject("ct1")).points
+    ct = phantom.reference_cloud(phantom.draw_subject("ct1", PHANTOM_SEED), 4000, rng)
+    us = phantom.anterior_cloud(phantom.draw_subject("patient", PHANTOM_SEED), 3000, 0.5, 2, rng)
+    waypoints = phantom.waypoints(phantom.draw_subject("ct1", PHANTOM_SEED)).points
     for cloud, name in ((ct, "ct"), (us, "us")):
         T = RigidTransform.random(rng)
         write_ply(PointCloud(T.apply(cloud.points)), folder / f"{name}.ply")
@@ -252,7 +253,7 @@ def test_a_cloud_from_labels_and_from_landmarks(tmp_path: Path, capsys: Capture)
     assert main(["cloud", "ct.nii.gz", "--labels", "labels.nii.gz", *options, "a.ply"]) == 0
     assert main(["cloud", "ct.nii.gz", "--landmarks", "ct.yaml", *options, "b.ply"]) == 0
     assert "2000 points of sternum and cartilages 2-5, mm RAS+: a.ply" in capsys.readouterr().out
-    surface = phantom.reference_cloud(subject("ct1"), 20000, np.random.default_rng(0)).points
+    surface = phantom.reference_cloud(phantom.draw_subject("ct1", PHANTOM_SEED), 20000, np.random.default_rng(0)).points
     for name, limit_mm in (("a.ply", 1.5), ("b.ply", 3.0)):
         points = read_ply(tmp_path / name)
         assert points.shape == (2000, 3)

@@ -108,7 +108,7 @@ def choices() -> pd.DataFrame:
     rows = [
         ("rate", "constant", "paper", 2.0),
         ("rate", "compounding", "authors", 2.5),
-        ("rate", "linear", "better", 1.75),
+        ("rate", "linear", "alternative", 1.75),
     ]
     return pd.DataFrame(
         [
@@ -270,6 +270,13 @@ def test_ct_slice_draws_right_parts_left_and_contours_where_the_mask_is() -> Non
     np.testing.assert_allclose(right[:, 1].max(), inside[:, 1].max() + 0.75, atol=1e-6)
 
 
+def test_the_legend_of_a_slice_names_only_what_is_there() -> None:
+    shown = texts(figures.ct_slice(*volumes()))
+    assert "sternum" in shown
+    assert "cartilage 3" in shown
+    assert "cartilage 4" not in shown
+
+
 def test_image_pixels_lie_at_their_millimetres() -> None:
     volume, mask = volumes()
     values = np.array(volume.values)
@@ -315,6 +322,20 @@ def test_one_way_edges_are_arrows_in_their_direction() -> None:
     assert "2 of them one-way" in texts(figure)
 
 
+def test_fitted_graphs_have_no_arrows() -> None:
+    top, *fitted = EVERY["graph_triptych"]().axes
+    assert len(top.findobj(Quiver)) == 1
+    assert [len(ax.findobj(Quiver)) for ax in fitted] == [0, 0]
+    assert [len(ax.findobj(LineCollection)[0].get_segments()) for ax in fitted] == [len(GRAPH.edges)] * 2
+
+
+def test_before_the_alignment_only_the_patients_axes_are_named() -> None:
+    before, after, _ = EVERY["coarse_overlay"]().axes
+    assert "US patient's axes" in before.get_xlabel()
+    assert not before.texts
+    assert {text.get_text() for text in after.texts} == {"R", "L"}
+
+
 def test_triptych_numbers_every_node_of_the_template() -> None:
     figure = EVERY["graph_triptych"]()
     numbers = {text.get_text() for text in figure.axes[0].texts}
@@ -330,8 +351,8 @@ def test_registrations_share_one_colour_scale() -> None:
         if drawn.get_array() is not None and len(drawn.axes.texts)
     }
     assert len(scales) == 1
-    assert "Skeleton graph: mean 1.0" in texts(figure)
-    assert "ICP: mean" in figure.axes[0].get_title(loc="left")
+    assert "Skeleton graph\nmean 1.0" in texts(figure)
+    assert "ICP\nmean" in figure.axes[0].get_title(loc="left")
 
 
 def test_path_joins_waypoints_within_a_space_only_and_says_the_error() -> None:
@@ -377,6 +398,24 @@ def test_a_failed_case_is_named_where_its_box_would_be() -> None:
     assert ", n=2" in texts(figures.hd_bars(failing()))
 
 
+def test_a_subject_whose_methods_all_failed_says_so_once() -> None:
+    table = pd.concat([failing(method=method).query("subject == 'ct2' and method == @method") for method in METHODS])
+    whole = metrics()
+    table = pd.concat([whole[whole["subject"] != "ct2"], table], ignore_index=True)
+    for draw in (figures.waypoint_boxes, figures.hd_bars):
+        words = [text.get_text() for text in draw(table).axes[0].texts if "failed" in text.get_text()]
+        assert words == ["failed"]
+
+
+def test_the_truth_is_drawn_last_like_a_tuned_method() -> None:
+    methods = ("truth", *METHODS)
+    assert figures.in_order(methods)[-1] == "truth"
+    style = figures.method_style("truth")
+    assert (style.tuned, style.hatch, style.marker) == (True, "", "*")
+    for draw in (figures.waypoint_boxes, figures.hd_bars):
+        assert "Perfect (truth)" in texts(draw(metrics(methods), paper=PAPER))
+
+
 def test_uneven_boxes_print_their_own_n() -> None:
     table = metrics().drop(index=0)
     shown = texts(figures.waypoint_boxes(table))
@@ -392,7 +431,7 @@ def test_bars_end_with_the_mean_and_the_population_sd() -> None:
     assert len(bars) == (len(SUBJECTS) + 1) * len(METHODS)
     icp = table[(table["method"] == "icp") & (table["metric"] == "hd")].groupby("subject")["value"].mean()
     assert bars[3].get_height() == pytest.approx(icp.mean())
-    assert f"{icp.mean():.1f}±{icp.std(ddof=0):.1f}" in texts(figure)
+    assert f"{icp.mean():.2f}±{icp.std(ddof=0):.2f}" in texts(figure)
     assert "paper, other data" in texts(figure)
 
 
@@ -406,10 +445,49 @@ def test_sensitivity_shows_paired_differences() -> None:
     figure = figures.sensitivity(choices())
     shown = texts(figure)
     assert "+0.50 (n=4)" in shown
-    assert "-0.25 (n=4)" in shown
+    assert "−0.25 (n=4)" in shown
     assert "constant → compounding" in shown
     cloud = figure.axes[0].collections[0].get_offsets()
     np.testing.assert_allclose(cloud[:, 0], 0.5)
+
+
+def test_a_wide_option_does_not_stretch_the_axis_and_says_how_far_it_goes() -> None:
+    table = choices()
+    wide = table[table["option"] == "compounding"].assign(option="all nodes", value=lambda t: t["value"] + 4.0)
+    near = table[table["option"] == "constant"].assign(option="others", role="yardstick", choice="draws")
+    draws = table[table["option"] == "constant"].assign(choice="draws")
+    figure = figures.sensitivity(pd.concat([table, wide, draws, near]))
+    (ax,) = figure.axes
+    assert ax.get_xlim()[1] < 1.3
+    assert "4 cases, to +4.50" in texts(figure)
+    assert "0.00 (n=4)" in texts(figure)
+    assert not any(sign + "0.00" in texts(figure) for sign in "+-−")
+    assert len([p for p in ax.patches if isinstance(p, Rectangle)]) == 1  # the yardstick's band
+
+
+def paired() -> pd.DataFrame:
+    rows = [
+        {"dataset": dataset, "method": method, "difference": k - 2.0}
+        for dataset in ("open", "phantom")
+        for method in (*METHODS[:3], "truth")
+        for k in range(3)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_paired_differences_say_once_which_side_is_better() -> None:
+    figure = figures.paired_differences(paired(), "skeleton_graph", "Waypoint error")
+    shown = texts(figure)
+    assert shown.count("better") == 1
+    assert shown.startswith("Waypoint error: ") or "\nWaypoint error: " in shown
+    assert [ax.get_xlabel() for ax in figure.axes] == ["difference (mm)"] * 2
+    assert "Perfect (truth)" in shown
+
+
+def test_error_views_explain_bar_and_number() -> None:
+    shown = texts(figures.error_views(metrics(), ("waypoint_error",)))
+    assert "mean waypoint error of a pair (mm)" in shown
+    assert "population SD" in shown
 
 
 def test_error_budget_keeps_the_order_of_sources_and_starts_at_zero() -> None:

@@ -28,7 +28,7 @@ def run(folder: Path) -> tuple[Path, Path, ArchiveServer]:
     """Results of a run, its manifest, and the server it fetched from; one of the three scans is damaged."""
     images, labels = {}, {}
     for number, name in SCANS.items():
-        image, ids = scan(name, flat=True)
+        image, ids = scan(name)
         images[number] = nifti(image, folder / "made" / f"{number}.nii.gz").read_bytes()
         labels[number] = nifti(ribseg_labels(ids), folder / "made" / f"{number}-ribs.nii.gz").read_bytes()
     images[DAMAGED], labels[DAMAGED] = images[421][:-5000], labels[421]
@@ -53,7 +53,7 @@ def run(folder: Path) -> tuple[Path, Path, ArchiveServer]:
 
 def test_the_labels_hold_ribs_only_numbered_from_the_right() -> None:
     """The stand-in is what RibSeg gives: no cartilage, no sternum, right ribs first."""
-    _, labels = scan("ct1", flat=True)
+    _, labels = scan("ct1")
     ribs = ribseg_labels(labels)
     ids = structure_ids()
     assert set(np.unique(ribs.values)) == {0, *range(1, 8), *range(13, 20)}  # seven ribs reach the front

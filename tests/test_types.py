@@ -69,7 +69,7 @@ def test_a_cloud_refuses_other_units_few_points_and_wrong_labels():
         PointCloud(BOX[:49])
     with pytest.raises(StudyError, match=r"expected one part per point \(200,\), got \(199,\)"):
         PointCloud(BOX, parts=np.zeros(199, dtype=np.int64))
-    with pytest.raises(StudyError, match="expected labelled parts, got none; run"):
+    with pytest.raises(StudyError, match="expected labelled parts, got none; label it"):
         PointCloud(BOX).only(Part.STERNUM)
 
 

@@ -88,7 +88,7 @@ def test_a_cartilage_with_a_gap_wider_than_a_part_is_refused(chest):
 
 
 def test_labels_and_a_known_cut_are_needed(chest):
-    with pytest.raises(StudyError, match="label_parts first"):
+    with pytest.raises(StudyError, match="find_chest first"):
         intercostal_waypoints(replace(chest, parts=None))
     with pytest.raises(StudyError, match=r"kmeans\|slices"):
         intercostal_waypoints(chest, "median")

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 import tempfile
@@ -42,6 +43,7 @@ def code(path: Path) -> list[str]:
 
 def execute(source: Path, target: Path, parameters: dict[str, Any]) -> None:
     """Execute one percent notebook with parameters; a failed cell raises with its traceback."""
+    logging.getLogger("papermill").setLevel(logging.ERROR)  # Open3D's widgets warn that no page listens
     notebook = jupytext.read(source)
     notebook.metadata["kernelspec"] = {"name": KERNEL, "display_name": "Python 3", "language": "python"}
     notebook.metadata.pop("papermill", None)

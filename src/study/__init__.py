@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Found on first use: importing the methods costs seconds, which `study data list` need not pay.
 _HOMES = {"METHODS": "study.methods", "register_pair": "study.pipeline", "StudyError": "study.errors"}

@@ -23,6 +23,7 @@ from study.cohorts import (
     Patient,
     fetch_subject,
     files_of_subject,
+    has_truth,
     load_anatomy,
     make_patient,
     origin_of,
@@ -33,7 +34,7 @@ from study.cohorts import (
 from study.data.manifest import Manifest, load_manifest
 from study.errors import StudyError
 from study.methods import METHODS
-from study.metrics import hausdorff_mm, hd95_mm, mean_surface_distance_mm, point_errors_mm, waypoint_errors_mm
+from study.metrics import TRUTH, hausdorff_mm, hd95_mm, mean_surface_distance_mm, point_errors_mm, waypoint_errors_mm
 from study.params import StudyParams
 from study.pipeline import find_method, named_rng, register_aligned
 from study.results import (
@@ -197,11 +198,12 @@ def run_dataset(
         f"{dataset}: pairs",
         {(s, t): (_pair, dataset, anatomies[s], patients[t], chests["ct", s], chests["us", t]) for s, t in todo},
     )
+    judged = [*chosen, TRUTH] if has_truth(dataset) else chosen
     cases = workers.run(
         f"{dataset}: registrations",
         {
             case: (run_case, dataset, case, matched[case.source, case.target], seed, params.radius_mm)
-            for case in (Case(source, target, method) for source, target in todo for method in chosen)
+            for case in (Case(source, target, method) for source, target in todo for method in judged)
         },
     )
 
@@ -255,15 +257,24 @@ def _pair(dataset: str, anatomy: Anatomy, patient: Patient, chest_ct: Chest, che
 
 
 def run_case(dataset: str, case: Case, pair: Pair, seed: int, radius_mm: float) -> list[Row]:
-    """The rows of one case.
+    """The rows of one case; of method ``TRUTH``, what a perfect registration scores.
 
     Raises:
         StudyError: the method or the path transfer failed.
     """
-    rng = named_rng(seed, f"{case.source}/{case.target}/{case.method}")
-    result = register_aligned(pair.alignment, find_method(case.method), rng)
+    if case.method == TRUTH:
+        result = _perfect(pair)
+    else:
+        rng = named_rng(seed, f"{case.source}/{case.target}/{case.method}")
+        result = register_aligned(pair.alignment, find_method(case.method), rng)
     values = evaluate(pair, result, radius_mm)
     return metric_rows(dataset, case.source, case.target, case.method, seed, values, converged=result.converged)
+
+
+def _perfect(pair: Pair) -> Registration:
+    assert pair.true_points is not None
+    source = pair.alignment.source.cloud.points
+    return Registration(source, pair.true_points, pair.alignment.T_us_ct, True, 0, "the truth itself", method=TRUTH)
 
 
 def evaluate(pair: Pair, result: Registration, radius_mm: float = 20.0) -> dict[str, Any]:

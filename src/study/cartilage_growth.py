@@ -12,6 +12,7 @@ ends come from per-rib labels (`landmarks_from_ribs`) or from a recorded file (`
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,7 @@ AIR_HU = -200.0  # a chest CT in Hounsfield units has lung and room air far belo
 JOINT_MM = 4.0  # a line's last cross-section runs on this far, to meet the sternum all around
 ATTACHED_MM = 8  # a recorded attachment is that close to the bone it belongs to
 MAX_LENGTH_MM = 130.0  # of a cartilage, end to end
+AHEAD_MM = (0.0, 10.0, 20.0)  # of the plane through the rib ends lies the sternum: the rounder the chest, the more
 N_RAYS = 36
 RAY_MM = np.arange(0.5, 12.01, 0.5)
 
@@ -116,14 +118,23 @@ def landmarks_from_ribs(ct: Volume, labels: Volume, ids: Mapping[str, int], grow
     heights = np.array([ends[:, 2].max() + 20.0, ends[:, 2].min() - 5.0])  # the attachments are higher than the ends
     line = np.stack([np.polyval(line_x, heights), np.zeros(2), heights], axis=1)
     line[:, 1] = np.c_[np.ones(2), line[:, [0, 2]]] @ plane
-    image = _isotropic(ct, np.vstack([ends, line]))
-    sternum = find_sternum(image, line, growth)
+    lines = [line + np.array([0.0, ahead, 0.0]) for ahead in AHEAD_MM]
+    image = _isotropic(ct, np.vstack([ends, *lines]))
+    line, sternum = _first_sternum(image, lines, growth)
     cost = _path_cost(image, _on_grid(_rib_mask(labels, ids), image), growth)
     attachments = {}
     for part in CARTILAGES:
         path = _cheapest_path(image, cost, junctions[part], sternum, part)
         attachments[part] = image.to_mm(path[-1:])[0]
     return Landmarks(ct.name, junctions, attachments, line, "landmarks_from_ribs", "from rib labels")
+
+
+def _first_sternum(image: Volume, lines: list[Floats], growth: Growth) -> tuple[Floats, Bools]:
+    """The first midline (p, 3) mm around which there is a sternum, and that sternum."""
+    for line in lines[:-1]:
+        with suppress(StudyError):
+            return line, find_sternum(image, line, growth)
+    return lines[-1], find_sternum(image, lines[-1], growth)
 
 
 def rib_ends(labels: Volume, ids: Mapping[str, int]) -> dict[Part, Floats]:

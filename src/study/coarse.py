@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from study.cartilage import MAX_OFFSET_MM, Branches, find_branches
 from study.errors import StudyError
@@ -14,7 +15,8 @@ from study.sternum import SternumFit, SternumParams, feature_plane, sternum_cand
 from study.types import CARTILAGES, ChestFrame, Floats, Part, PointCloud, RigidTransform
 
 MIN_BULGE_MM = 0.2
-MIN_BEND_RATIO = 1.8  # sound clouds have 3 and more; where strips cut ends off it falls to 1.1, and is wrong
+HALF_MM = 6.0  # half the width of a cartilage
+MIN_BEND_RATIO = 1.5  # sound clouds have 3 and more; where strips cut ends off it falls to 1, and is wrong
 # What tells eight cartilages from eight pieces of something else. On 251 whole clouds of development and real people:
 # offset 11 or less, apart 14 or more, length 15 or more, touch 0.21 or less, fill 0.47 or less.
 MIN_APART_MM = 12.0  # between the roots of neighbours
@@ -178,7 +180,7 @@ def _check_branches(branches: Branches, local: Floats, name: str) -> None:
     touch = max(max(_share_near(one, other), _share_near(other, one)) for one, other in neighbours)
     if touch > MAX_TOUCH:
         raise StudyError(
-            f"{name}: expected cartilages apart from their neighbours beside the sternum, got {touch:.2f} of one within "
+            f"{name}: expected cartilages apart from each other beside the sternum, got {touch:.2f} of one within "
             f"{TOUCH_MM:g} mm of the next, need {MAX_TOUCH:g} or less; is a branch missing?"
         )
     seeds = branches.seeds.reshape(2, 4, 2)
@@ -230,13 +232,18 @@ def _bulge_mm(branch: Floats, sternum: Floats) -> float:
 
 
 def _bend_mm(branch: Floats) -> float:
-    """How far a branch strays in the feature plane from the straight line between its ends (mm)."""
+    """How far a branch strays in the feature plane from the straight line between its ends (mm).
+
+    Robust: pieces of a neighbour that the flood gave to this branch would bend it.
+    """
     flat = branch[:, :2] - branch[:, :2].mean(axis=0)
     _, _, axes = np.linalg.svd(flat, full_matrices=False)
     along, across = (flat @ axes.T).T
     a, b = np.percentile(along, [2, 98])
     t = 2 * (along - a) / (b - a) - 1
-    return abs(float(np.polynomial.polynomial.polyfit(t, across, 2)[2]))
+    powers = np.stack([np.ones_like(t), t, t * t])
+    fit = least_squares(lambda c: c @ powers - across, np.zeros(3), lambda _: powers.T, loss="cauchy", f_scale=HALF_MM)
+    return abs(float(fit.x[2]))
 
 
 def sternum_front_mm(local: Floats, params: SternumParams) -> float:

@@ -130,18 +130,28 @@ def load_anatomy(
     origin = origin_of(dataset, name)
     if origin is not None:
         return plant(load_anatomy(dataset, origin, params, seed, manifest), name)
-    rng = named_rng(seed, f"{dataset}/{name}/anatomy")
     manifest = manifest or load_manifest()
     cohort, subject = _subject(dataset, name, manifest)
     if cohort.kind == "generated":
-        drawn = phantom.draw_subject(name, PHANTOM_SEED)
-        image, labels = phantom.ct_volume(drawn, params.phantom_spacing_mm, named_rng(PHANTOM_SEED, f"ct/{name}"))
-        ids = manifest.label_ids("totalsegmentator_v2")
-        mask = parts_from_labels(labels, ids)
-    else:
-        image, mask = _read(manifest, subject)
-    anatomy = anatomy_of(name, image, mask, params.ct_points, rng)
-    return replace(anatomy, waypoints=phantom.waypoints(drawn)) if cohort.kind == "generated" else anatomy
+        return phantom_anatomy(name, PHANTOM_SEED, params, seed)
+    image, mask = _read(manifest, subject)
+    return anatomy_of(name, image, mask, params.ct_points, named_rng(seed, f"{dataset}/{name}/anatomy"))
+
+
+def phantom_anatomy(name: str, cohort_seed: int, params: StudyParams, seed: int = 0) -> Anatomy:
+    """A synthetic person by the road of a real CT: volume and labels, surface, cloud; the waypoints are exact.
+
+    Args:
+        name: one of ``phantom.SUBJECTS``.
+        cohort_seed: draws the person; ``PHANTOM_SEED`` is the reported cohort's.
+        params: density of volume and cloud.
+        seed: of the cloud's samples.
+    """
+    drawn = phantom.draw_subject(name, cohort_seed)
+    image, labels = phantom.ct_volume(drawn, params.phantom_spacing_mm, named_rng(cohort_seed, f"ct/{name}"))
+    mask = parts_from_labels(labels, load_manifest().label_ids("totalsegmentator_v2"))
+    anatomy = anatomy_of(name, image, mask, params.ct_points, named_rng(seed, f"phantom/{name}/anatomy"))
+    return replace(anatomy, waypoints=phantom.waypoints(drawn))
 
 
 def anatomy_of(name: str, image: Volume, mask: Volume, n_points: int, rng: np.random.Generator) -> Anatomy:
@@ -256,6 +266,11 @@ def plant(source: Anatomy, name: str) -> Anatomy:
 
 def _deformation(mesh: Mesh, name: str) -> TruthMap:
     return planted_deformation(mesh.vertices, PLANTED_SIZES_MM[name], named_rng(0, f"planted/{name}")).apply
+
+
+def has_truth(dataset: str) -> bool:
+    """Whether the deformation between a dataset's people is known."""
+    return dataset in ("phantom", "planted")
 
 
 def truth_map(dataset: str, source: Anatomy, target: str) -> TruthMap | None:

@@ -16,6 +16,11 @@ from study.types import Floats, as_points
 MIN_PAIRS = 6  # two-sided, 5 pairs cannot give less than p = 2 / 2**5 = 0.0625
 
 
+# In place of a method: the known deformation itself, carried and measured as a method's answer is. What it scores is
+# what a perfect registration would, under this protocol.
+TRUTH = "truth"
+
+
 @dataclass(frozen=True)
 class Metric:
     """What a row of ``metrics.csv`` measures.

@@ -12,7 +12,6 @@ import numpy as np
 from study.errors import StudyError
 
 PHANTOM_SEED = 1  # draws the reported phantom anatomies; their mean distance after a rigid fit lies in 5-10 mm
-DEVELOPMENT_SEED = 101  # draws the anatomies that parameters may be tuned on; none of them is ever reported
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from study.errors import StudyError
 from study.methods import METHODS
-from study.metrics import METRICS, population_sd
+from study.metrics import METRICS, TRUTH, population_sd
 
 KEY = ("dataset", "subject", "target", "method", "seed", "metric", "index")
 COLUMNS = (*KEY, "value", "unit", "status")
@@ -423,6 +423,8 @@ def beside_paper(table: pd.DataFrame, paper: pd.DataFrame | None = None) -> tupl
         "The paper's rows are its Table I as printed, five other CTs against one volunteer: "
         "compare the order of the methods, not the numbers."
     )
+    if TRUTH in table.index:
+        note += f" {TRUTH}: the known deformation itself, what a perfect registration would score."
     return display, note
 
 

@@ -128,7 +128,9 @@ class PointCloud:
     def only(self, *parts: Part) -> Floats:
         """The points of some parts, (k, 3) mm."""
         if self.parts is None:
-            raise StudyError(f"{self.name}: expected labelled parts, got none; run study.cartilage.label_parts first")
+            raise StudyError(
+                f"{self.name}: expected labelled parts, got none; label it with study.coarse.find_chest first"
+            )
         return self.points[np.isin(self.parts, [int(part) for part in parts])]
 
     def moved(self, transform: RigidTransform) -> PointCloud:

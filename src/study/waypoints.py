@@ -39,7 +39,9 @@ def intercostal_waypoints(cloud: PointCloud, cut: Literal["kmeans", "slices"] = 
     if cut not in ("kmeans", "slices"):
         raise StudyError(f"expected cut kmeans|slices, got {cut!r}")
     if cloud.parts is None:
-        raise StudyError(f"{cloud.name}: expected labelled parts, got none; run study.cartilage.label_parts first")
+        raise StudyError(
+            f"{cloud.name}: expected labelled parts, got none; label it with study.coarse.find_chest first"
+        )
     branches = {part: cloud.only(part) for part in CARTILAGES}
     for part, points in branches.items():
         needed = _MIN_POINTS_PER_PART * max(N_WAYPOINTS.values())

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from study.errors import StudyError
 from study.figures.style import (
     PART_COLOUR,
+    WIDTH_IN,
     bounds,
     dots,
     draw_surface,
@@ -87,13 +88,13 @@ def ct_slice(
     window_hu: tuple[float, float] = (-160.0, 350.0),
     margin_mm: float = 25.0,
 ) -> Figure:
-    """An axial and a coronal slice with the contour of each part.
+    """An axial slice and, below it, a coronal one at the same scale, with the contour of each part.
 
     Args:
         volume: Hounsfield units, axes along R, A, S.
         mask: `Part` values on the same grid or a crop of it.
         reference: other parts on the grid of ``mask``, dashed.
-        at_mm: (3,) RAS+ place the slices go through; without it, where most of them is seen.
+        at_mm: (3,) RAS+ place the slices go through, ringed; without it, they go where most parts are seen.
         window_hu: darkest and brightest value.
         margin_mm: shown around the mask.
 
@@ -109,25 +110,38 @@ def ct_slice(
         if not all(0 <= index < n for index, n in zip(cut, mask.shape, strict=True)):
             raise StudyError(f"expected a place inside {mask.name}, got {at_mm} mm; take a point of the mask")
     boxes = [np.flatnonzero(labelled.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
-    figure = new_figure(4.6, f"{volume.name}: parts on the CT, window {window_hu[0]:g} to {window_hu[1]:g} HU")
-    for ax, (axis, up, title) in zip(figure.subplots(1, 2), ((2, 1, "axial"), (1, 2, "coronal")), strict=True):
-        x, y = -_grid_mm(volume, 0), _grid_mm(volume, up)
-        shown = np.take(volume.values, first[axis] + cut[axis], axis)
-        _grey_image(ax, shown, x, y, window_hu)
+    x = -_grid_mm(volume, 0)
+    views, shown = [], set()
+    for axis, up, title in ((2, 1, "axial"), (1, 2, "coronal")):
+        y = _grid_mm(volume, up)
         mine = [grid[first[a] : first[a] + mask.shape[a]] for a, grid in ((0, x), (up, y))]
-        _part_contours(ax, mine, np.take(mask.values, cut[axis], axis), _DRAWN, linewidths=1.4)
-        if reference is not None:
-            white: Mapping[Part, Any] = dict.fromkeys(_DRAWN, "white")
-            other = np.take(mask.with_values(reference.values).values, cut[axis], axis)
-            _part_contours(ax, mine, other, white, linewidths=0.9, linestyles="dashed")
         (xa, xb), (ya, yb) = (
             (grid[box[0]], grid[box[-1]]) for grid, box in zip(mine, (boxes[0], boxes[up]), strict=True)
         )
         extent = np.array([[min(xa, xb) - margin_mm, ya - margin_mm], [max(xa, xb) + margin_mm, yb + margin_mm]])
+        parts = np.take(mask.values, cut[axis], axis)
+        shown |= {part for part in _DRAWN if (parts == part).any()}
+        views.append((axis, up, title, y, mine, extent, parts))
+    heights = [float(np.ptp(extent[:, 1])) for *_, extent, _ in views]
+    scale = min((WIDTH_IN - 1.0) / float(np.ptp(views[0][5][:, 0])), 8.0 / sum(heights))  # inches a mm
+    figure = new_figure(
+        scale * sum(heights) + 2.1, f"{volume.name}: parts on the CT, window {window_hu[0]:g} to {window_hu[1]:g} HU"
+    )
+    panels = figure.subplots(2, 1, height_ratios=heights)
+    for ax, (axis, up, title, y, mine, extent, parts) in zip(panels, views, strict=True):
+        _grey_image(ax, np.take(volume.values, first[axis] + cut[axis], axis), x, y, window_hu)
+        _part_contours(ax, mine, parts, _DRAWN, linewidths=1.4)
+        if reference is not None:
+            white: Mapping[Part, Any] = dict.fromkeys(_DRAWN, "white")
+            other = np.take(mask.with_values(reference.values).values, cut[axis], axis)
+            _part_contours(ax, mine, other, white, linewidths=0.9, linestyles="dashed")
+        if at_mm is not None:
+            place_mm = np.asarray(at_mm, dtype=np.float64).ravel()
+            ax.scatter(-place_mm[0], place_mm[up], s=260, fc="none", ec="#F0E442", lw=1.6, zorder=5)
         place = _grid_mm(volume, axis)[first[axis] + cut[axis]]
         look(ax, "front", extent, f"{title}, {'S' if axis == 2 else 'A'} = {place:.1f} mm", on_dark=True)
         ax.set_ylabel("to the front (mm)" if up == 1 else "up (mm)", fontsize=8)
-    part_legend(figure)
+    part_legend(figure, shown=shown)
     return figure
 
 

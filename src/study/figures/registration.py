@@ -81,6 +81,7 @@ class CoarseView:
     size_mm: tuple[float, float] = (30.0, 90.0)
 
 
+_EDGE_COLOUR, _SEED_COLOUR, _ERROR_COLOUR = "#882255", "#F0E442", "#DC0050"
 _SCALE_STYLE = (("#555555", 3.5), ("#56B4E9", 2.2), ("#D55E00", 1.6))
 
 
@@ -101,9 +102,10 @@ def coarse_steps(views: Mapping[str, CoarseView]) -> Figure:
             coloured = ax is row[2]
             dots(ax, points, part_colours(view.parts, len(points)) if coloured else "#9db2c4", size=3)
             look(ax, "front" if coloured else "side", bounds(points, margin_mm=16.0 if coloured else 8.0), title)
-            if not coloured:
-                ax.set_xlabel("in the plane (mm)", fontsize=8)
-                ax.set_ylabel("", fontsize=8)
+        row[0].set_xlabel("x in the plane (mm)", fontsize=8)
+        row[0].set_ylabel("y in the plane (mm)", fontsize=8)
+        row[1].set_xlabel("across the sternum (mm)", fontsize=8)
+        row[1].set_ylabel("along the sternum (mm)", fontsize=8)
         half = np.array(view.size_mm) / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
         for (scale, centre, angle), style in zip(view.rectangles, _SCALE_STYLE, strict=False):
             c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
@@ -114,10 +116,12 @@ def coarse_steps(views: Mapping[str, CoarseView]) -> Figure:
             )
         row[1].axvline(0, color=DARK, lw=0.8, ls=":")
         for x in (-view.edges_mm[0], view.edges_mm[1]):
-            row[1].axvline(x, color="#D55E00", lw=1.6)
-        row[1].scatter(*np.asarray(view.seeds).T, s=55, marker="*", c="#D55E00", ec="black", lw=0.6, zorder=5)
+            row[1].axvline(x, color=_EDGE_COLOUR, lw=1.6)
+        row[1].scatter(*np.asarray(view.seeds).T, s=70, marker="*", c=_SEED_COLOUR, ec="black", lw=0.7, zorder=5)
         name_parts(row[2], flat[2], view.parts)
-    part_legend(figure, [scales[scale] for scale in sorted(scales, reverse=True)])
+    edge = Line2D([], [], color=_EDGE_COLOUR, lw=1.6, label="edge of the sternum")
+    seed = Line2D([], [], ls="", marker="*", ms=9, color=_SEED_COLOUR, mec="black", mew=0.7, label="seed of a branch")
+    part_legend(figure, [*(scales[scale] for scale in sorted(scales, reverse=True)), edge, seed])
     return figure
 
 
@@ -145,7 +149,12 @@ def coarse_overlay(
     for ax, pair, view, extent, title in zip(panels, pairs, views, extents, titles, strict=True):
         for points, colour in zip(pair, (CT_COLOUR, US_COLOUR), strict=True):
             dots(ax, points, colour, size=3, alpha=0.55)
-        look(ax, view, extent, title)
+        if ax is not panels[0]:
+            look(ax, view, extent, title)
+    # Before, the CT has no left or up that holds in this frame.
+    look(panels[0], "side", extents[0], titles[0])
+    panels[0].set_xlabel("US patient's axes: left (mm)", fontsize=8)
+    panels[0].set_ylabel("US patient's axes: up (mm)", fontsize=8)
     handles = [Line2D([], [], ls="", marker="o", color=c, label=n) for c, n in ((CT_COLOUR, "CT"), (US_COLOUR, "US"))]
     below(figure, handles, 2)
     return figure
@@ -163,7 +172,14 @@ def _counted(graph: SkeletonGraph) -> str:
 
 
 def _draw_graph(
-    ax: Axes, graph: SkeletonGraph, points: ArrayLike | None, T: RigidTransform | None, numbers: bool, title: str
+    ax: Axes,
+    graph: SkeletonGraph,
+    points: ArrayLike | None,
+    T: RigidTransform | None,
+    numbers: bool,
+    title: str,
+    *,
+    directed: bool = True,
 ) -> None:
     nodes = project(graph.nodes, "front", T)
     extent = bounds(nodes, margin_mm=12.0)
@@ -171,7 +187,7 @@ def _draw_graph(
         cloud = project(points, "front", T)
         extent = bounds(nodes, cloud)
         dots(ax, cloud, PALE, size=3)
-    single = one_way(graph.edges)
+    single = one_way(graph.edges) & directed
     flat = nodes[:, :2]
     links = LineCollection(list(flat[graph.edges[~single]]), colors="#777777", linewidths=0.7, zorder=2)
     ax.add_collection(links)
@@ -226,13 +242,18 @@ def graph_triptych(
     *,
     T_cloud_chest: RigidTransform | None = None,
 ) -> Figure:
-    """The paper's Fig. 3: the numbered template, then the graph on the CT and on the US cloud, all in one frame."""
+    """The paper's Fig. 3: the numbered template, then the graph on the CT and on the US cloud, all in one frame.
+
+    The template is directed; the fitted graphs are undirected by then, and have no arrows.
+    """
     figure = new_figure(10.6, "Skeleton graph: the template, then the two maps")
     grid = figure.add_gridspec(2, 2, height_ratios=[1.45, 1])
     top, left, right = (figure.add_subplot(grid[place]) for place in ((0, slice(None)), (1, 0), (1, 1)))
     _draw_graph(top, template, None, T_cloud_chest, True, f"template: {_counted(template)}")
-    _draw_graph(left, g_ct, ct_points, T_cloud_chest, False, "graph of the CT cloud, from the template")
-    _draw_graph(right, g_us, us_points, T_cloud_chest, False, "graph of the US cloud, from the CT graph")
+    _draw_graph(left, g_ct, ct_points, T_cloud_chest, False, "graph of the CT cloud, from the template", directed=False)
+    _draw_graph(
+        right, g_us, us_points, T_cloud_chest, False, "graph of the US cloud, from the CT graph", directed=False
+    )
     part_legend(figure)
     return figure
 
@@ -253,8 +274,8 @@ def som_progress(histories: Mapping[str, Sequence[float]]) -> Figure:
         ax.plot(
             x,
             history,
-            marker="o",
-            ms=3.5,
+            marker="o" if len(history) <= 40 else "",
+            ms=3,
             color=colours[k % len(colours)],
             label=f"{name}: ends at {history[-1]:.2f} mm",
         )
@@ -292,11 +313,11 @@ def registration_grid(
     rows = -(-len(clouds) // 2)
     scale = (WIDTH_IN - 2.2) / (2 * sum(widths))  # inches a mm
     title = "Warped CT clouds on the US cloud (grey)"
-    figure = new_figure(0.5 + rows * (float(np.ptp(extents[0][:, 1])) * scale + 0.5), title)
+    figure = new_figure(0.5 + rows * (float(np.ptp(extents[0][:, 1])) * scale + 0.65), title)
     grid = figure.subplots(rows, 4, width_ratios=widths * 2, squeeze=False)
     drawn: Any = None
     for k, (name, points) in enumerate(clouds.items()):
-        text = f"{method_style(name).label}: mean {residual[name].mean():.1f}, largest {residual[name].max():.1f} mm"
+        text = f"{method_style(name).label}\nmean {residual[name].mean():.1f}, largest {residual[name].max():.1f} mm"
         for ax, view, extent, title in zip(
             grid[k // 2, 2 * (k % 2) :], views, extents, (text, "from the right"), strict=False
         ):
@@ -374,7 +395,7 @@ def transferred_path(
             ax.plot(*goal[rows_of_space, :2].T, color=DARK, lw=1.0)
             ax.plot(*found[rows_of_space, :2].T, color=style.colour, lw=1.3)
         ax.add_collection(
-            LineCollection(list(np.stack([goal, found], 1)[:, :, :2]), colors=DARK, linewidths=0.8, ls=":")
+            LineCollection(list(np.stack([goal, found], 1)[:, :, :2]), colors=_ERROR_COLOUR, linewidths=1.2, zorder=6)
         )
         ax.scatter(*goal[:, :2].T, s=34, fc="white", ec=DARK, lw=1.2, zorder=4)
         ax.scatter(*found[:, :2].T, s=30, marker=style.marker, fc=style.face, ec=style.colour, lw=1.2, zorder=5)
@@ -385,5 +406,6 @@ def transferred_path(
         ax.set_axis_off()
     hollow = Line2D([], [], marker="o", ls="-", mfc="white", color=DARK, label="defined on the patient")
     filled = Line2D([], [], marker="D", ls="-", color=GREY, label="transferred from CT, in the method's colour")
-    below(figure, [hollow, filled], 2)
+    error_line = Line2D([], [], color=_ERROR_COLOUR, lw=1.2, label="error of a waypoint")
+    below(figure, [hollow, filled, error_line], 3)
     return figure

@@ -11,10 +11,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from study.errors import StudyError
 from study.figures.style import (
     DARK,
+    GREY,
     PAPER,
     SIMULATED,
     below,
@@ -60,6 +62,16 @@ def _metric_label(metric: str) -> str:
     return f"{METRICS[metric].title} ({METRICS[metric].unit})" if metric in METRICS else f"{metric} (mm)"
 
 
+def _signed(value: float) -> str:
+    """Two decimals and a true minus sign; what rounds to 0 has none."""
+    text = f"{value:+.2f}"
+    return text.replace("-", "−") if float(text) else "0.00"
+
+
+def _all_failed(ax: Axes, middle: float) -> None:
+    ax.text(middle, 0.03, "failed", transform=ax.get_xaxis_transform(), ha="center", fontsize=8, color=DARK)
+
+
 def _groups(ax: Axes, names: Sequence[str], n_methods: int, n_groups: int) -> Floats:
     """Shade every other group and name it, with room for ``n_groups``; returns positions (group, method)."""
     width = n_methods + 1.2
@@ -78,6 +90,12 @@ def _paper_point(ax: Axes, x: float, method: str, paper: pd.DataFrame) -> None:
         mean, sd = paper.loc[[method], ["mean", "sd"]].to_numpy(dtype=np.float64)[0]
         line: dict[str, Any] = {"fmt": style.marker, "mfc": "white", "mec": style.colour, "mew": 1.4, "ms": 7}
         ax.errorbar(x, mean, sd, ecolor=style.colour, capsize=3, zorder=5, **line)
+
+
+def _highest(values: pd.Series, methods: Sequence[str], paper: pd.DataFrame | None) -> float:
+    """The largest value to show, the tip of the paper's markers included."""
+    rows = [] if paper is None else paper.loc[paper.index.isin(methods), ["mean", "sd"]].sum(axis=1).tolist()
+    return float(max([values.max(), *rows]))
 
 
 def waypoint_boxes(
@@ -106,24 +124,35 @@ def waypoint_boxes(
     panels = figure.subplots(n_rows, 1, squeeze=False, sharey=True).ravel()
     sizes = chosen.groupby(["subject", "method"]).size()
     even = sizes.nunique() == 1
+    high = _highest(chosen["value"], methods, paper)
     for ax, start in zip(panels, range(0, len(names), per_row), strict=False):
         here = names[start : start + per_row]
         places = _groups(ax, here, len(methods), per_row)
         for row, subject in zip(places, here, strict=True):
+            nothing = subject in set(failed["subject"]) and subject not in set(chosen["subject"])
+            if nothing:
+                _all_failed(ax, float(row.mean()))
             for x, method in zip(row, methods, strict=True):
                 if subject == PAPER and paper is not None:
                     _paper_point(ax, x, method, paper)
                     continue
                 mine = chosen[(chosen["subject"] == subject) & (chosen["method"] == method)]
                 values = mine["value"].to_numpy()
-                lost = bool(((failed["subject"] == subject) & (failed["method"] == method)).any())
+                lost = not nothing and bool(((failed["subject"] == subject) & (failed["method"] == method)).any())
                 _box(
-                    ax, x, values, method, "failed" if lost and not len(values) else "" if even else f"n={len(values)}"
+                    ax,
+                    x,
+                    values,
+                    method,
+                    "failed" if lost and not len(values) else "" if even or nothing else f"n={len(values)}",
                 )
         ax.set_ylabel(_metric_label(metric), fontsize=9)
-        ax.set_ylim(0, float(chosen["value"].max()) * (1.05 if even and failed.empty else 1.2))
+        ax.set_ylim(0, high * (1.05 if even and failed.empty else 1.2))
         ax.grid(axis="y", alpha=0.3)
-        plain(ax, f"n = {sizes.iloc[0]} waypoints a box" if even else "n: waypoints of a box")
+        plain(ax)
+    panels[0].set_title(
+        f"n = {sizes.iloc[0]} waypoints a box" if even else "n: waypoints of a box", fontsize=9.5, loc="left"
+    )
     dot = Line2D([], [], ls="", marker="_", ms=9, mew=2, color="black", label="median")
     hollow = Line2D([], [], ls="", marker="o", mfc="white", color=DARK, label=f"{PAPER}: mean ± SD")
     method_legend(figure, methods, [dot, hollow] if paper is not None else [dot])
@@ -137,7 +166,7 @@ def _box(ax: Axes, x: float, values: Floats, method: str, text: str) -> None:
             [values], positions=[x], widths=0.72, showfliers=False, patch_artist=True, manage_ticks=False
         )
         drawn["boxes"][0].set(facecolor=style.face, edgecolor=style.colour, hatch=style.hatch, linewidth=1.1)
-        drawn["medians"][0].set(color="black", linewidth=1.8)
+        drawn["medians"][0].set(color="white" if max(style.face) < 0.3 else "black", linewidth=1.8)
         for line in (*drawn["whiskers"], *drawn["caps"]):
             line.set(color=style.colour, linewidth=1.1)
         aside = ((np.arange(len(values)) * 0.618) % 1 - 0.5) * 0.5  # even, and the same every time
@@ -162,10 +191,15 @@ def hd_bars(
         StudyError: several datasets, or no value of that metric.
     """
     chosen, failed, subjects, methods = _cases(metrics, metric)
-    figure = new_figure(4.4, f"{METRICS[metric].title if metric in METRICS else metric}, CT to US ({note})")
+    figure = new_figure(4.4, f"{METRICS[metric].title if metric in METRICS else metric} ({note})")
     names = [*subjects, "mean ± SD", *([PAPER] if paper is not None else [])]
     ax = figure.subplots()
     places = _groups(ax, names, len(methods), len(names))
+    nothing = set(failed["subject"]) - set(chosen["subject"])
+    for row, subject in zip(places, subjects, strict=False):
+        if subject in nothing:
+            _all_failed(ax, float(row.mean()))
+    high = _highest(chosen["value"], methods, paper)
     for column, method in enumerate(methods):
         style, means = method_style(method), []
         bar: dict[str, Any] = {"width": 0.86, "fc": style.face, "ec": style.colour, "hatch": style.hatch, "lw": 1.0}
@@ -174,7 +208,7 @@ def hd_bars(
             if len(values):
                 means.append(values.mean())
                 ax.bar(x, means[-1], **bar)
-            elif ((failed["subject"] == subject) & (failed["method"] == method)).any():
+            elif subject not in nothing and ((failed["subject"] == subject) & (failed["method"] == method)).any():
                 ax.text(x, 0, " failed", rotation=90, ha="center", va="bottom", fontsize=7, color=style.colour)
             if len(values) > 1:
                 ax.scatter(np.full(len(values), x), values, s=7, c=DARK, lw=0, zorder=4)
@@ -182,16 +216,16 @@ def hd_bars(
         if means:
             mean, sd = float(np.mean(means)), population_sd(means)
             ax.bar(x, mean, yerr=sd, error_kw={"lw": 1.1, "capsize": 2.5}, **bar)
-            text = f"{mean:.1f}±{sd:.1f}" + ("" if len(means) == len(subjects) else f", n={len(means)}")
-            ax.text(x, mean + sd, f" {text}", rotation=90, ha="center", va="bottom", fontsize=7)
+            text = f"{mean:.2f}±{sd:.2f}" + ("" if len(means) == len(subjects) else f", n={len(means)}")
+            ax.text(x, 0.985, text, transform=ax.get_xaxis_transform(), rotation=90, ha="center", va="top", fontsize=7)
+            high = max(high, mean + sd)
         if paper is not None:
             _paper_point(ax, places[-1, column], method, paper)
     ax.set_ylabel(_metric_label(metric), fontsize=9)
-    ax.margins(y=0.2)
-    ax.set_ylim(0, None)
+    ax.set_ylim(0, high / 0.68)  # the numbers stand above everything else
     ax.grid(axis="y", alpha=0.3)
     ax.set_axisbelow(True)
-    plain(ax, f"SD: population, over n = {len(subjects)} CTs")
+    plain(ax, f"SD: population, over n = {len(subjects)} columns")
     hollow = Line2D([], [], ls="", marker="o", mfc="white", color=DARK, label=f"{PAPER}: mean ± SD")
     method_legend(figure, methods, [hollow] if paper is not None else [])
     return figure
@@ -200,16 +234,19 @@ def hd_bars(
 def sensitivity(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     """What each choice changes: paired differences of the mean waypoint error to the published choice.
 
+    A single option that changes much does not stretch the axis: what lies beyond it is an arrow and a number.
+
     Args:
-        df: a row per case and option, columns ``choice``, ``option`` (its name), ``role`` (``paper``, ``authors`` or
-            ``better``), ``case`` (what is paired) and ``value`` (mean waypoint error, mm).
+        df: a row per case and option, columns ``choice``, ``option`` (its name), ``role`` (``paper``, ``authors``,
+            ``alternative``, or ``yardstick``, whose spread is shaded over all rows), ``case`` (what is paired) and
+            ``value`` (mean waypoint error, mm).
         note: where the patient is from.
 
     Raises:
         StudyError: a choice without its published option, or an option without a paired case.
     """
     _table(df, ("choice", "option", "role", "case", "value"), "rows of choices")
-    roles = {"authors": ("authors' code", "#CC3311", "s"), "better": ("alternative", "#0077BB", "o")}
+    roles = {"authors": ("authors' code", "#CC3311", "s"), "alternative": ("alternative", "#0077BB", "o")}
     lines = []
     for choice, rows in df.groupby("choice", sort=False):
         base = rows[rows["role"] == "paper"].set_index("case")["value"]
@@ -221,19 +258,31 @@ def sensitivity(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
             lines.append((f"{choice}\n{published} → {option}", str(role), difference))
     require(lines, "options other than the published")
     figure = new_figure(
-        1.4 + 0.52 * len(lines), f"Change of the mean waypoint error against the published choice ({note})"
+        1.6 + 0.52 * len(lines), f"Change of the mean waypoint error against the published choice ({note})"
     )
     ax = figure.subplots()
+    size = np.abs(np.concatenate([difference for *_, difference in lines]))
+    end = float(np.clip(np.percentile(size, 95), 0.5, 1.2))
     for y, (_, role, difference) in enumerate(lines):
         _, colour, marker = roles.get(role, (role, DARK, "^"))
         aside = ((np.arange(len(difference)) * 0.618) % 1 - 0.5) * 0.36
+        mean, sd = float(difference.mean()), population_sd(difference)
         ax.scatter(difference, y + aside, s=14, c=colour, alpha=0.45, lw=0)
-        ax.errorbar(
-            difference.mean(), y, xerr=population_sd(difference), fmt=marker, color=colour, mec="black", ms=8, capsize=3
-        )
-        text = f"{difference.mean():+.2f} (n={len(difference)})"
+        ax.errorbar(mean, y, xerr=sd, fmt=marker, color=colour, mec="black", ms=8, capsize=3)
+        if role == "yardstick":
+            ax.axvspan(mean - sd, mean + sd, color="#e8e8e8", lw=0, zorder=0)
+        for side in (-1, 1):
+            beyond = difference[side * difference > end]
+            if len(beyond):
+                far = beyond[np.argmax(np.abs(beyond))]
+                text = _signed(far) if len(beyond) == 1 else f"{len(beyond)} cases, to {_signed(far)}"
+                ax.plot(side * end, y, marker="<>"[side > 0], ms=9, color=colour, mec="black", zorder=5)
+                at: dict[str, Any] = {"ha": "right" if side > 0 else "left", "va": "bottom", "fontsize": 7}
+                ax.text(side * 1.05 * end, y - 0.2, text, zorder=6, **at)
+        text = f"{_signed(mean)} (n={len(difference)})"
         ax.text(1.01, y, text, transform=ax.get_yaxis_transform(), va="center", fontsize=8)
     ax.axvline(0, color=DARK, lw=1)
+    ax.set_xlim(-1.06 * end, 1.06 * end)
     ax.set_yticks(range(len(lines)), [label for label, _, _ in lines])
     ax.set_ylim(len(lines) - 0.5, -0.5)
     ax.set_xlabel("better ←  difference per case, mean ± SD (mm)  → worse", fontsize=9)
@@ -241,8 +290,12 @@ def sensitivity(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     plain(ax)
     used = dict.fromkeys(role for _, role, _ in lines)
     marks = [roles.get(role, (role, DARK, "^")) for role in used]
-    handles = [Line2D([], [], ls="", marker=marker, color=colour, label=label) for label, colour, marker in marks]
-    below(figure, handles, 3)
+    handles: list[Any] = [Line2D([], [], ls="", marker=m, color=colour, label=label) for label, colour, m in marks]
+    if "yardstick" in used:
+        handles.append(Patch(color="#e8e8e8", label="yardstick, mean ± SD"))
+    if (size > end).any():
+        handles.append(Line2D([], [], ls="", marker=">", color=GREY, mec="black", label="cases beyond the axis"))
+    below(figure, handles, 5)
     return figure
 
 
@@ -332,7 +385,8 @@ def error_views(metrics: pd.DataFrame, views: Sequence[str], *, note: str = SIMU
         title = METRICS[view].title if view in METRICS else view
         ax.grid(axis="x", alpha=0.3)
         plain(ax, title.replace(" in the feature plane", ",\nin the feature plane"))
-        ax.set_xlabel("mm; dot: a case's mean", fontsize=8)
+        ax.set_xlabel("mean waypoint error of a pair (mm)", fontsize=8)
+    figure.supxlabel("dot: a pair; bar: mean ± population SD over pairs; number: that mean", fontsize=8, color=DARK)
     # Room for the means that are written at the right.
     panels[0].set_xlim(0, 1.28 * float(means["value"].max()))
     panels[0].set_yticks(range(len(methods)), [method_style(method).label for method in methods])
@@ -340,13 +394,13 @@ def error_views(metrics: pd.DataFrame, views: Sequence[str], *, note: str = SIMU
     return figure
 
 
-def paired_differences(df: pd.DataFrame, reference: str, unit: str, *, note: str = SIMULATED) -> Figure:
+def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str = SIMULATED) -> Figure:
     """One method against each other on the same cases: a panel a dataset, a row a method, a dot a case.
 
     Args:
         df: columns ``dataset``, ``method`` (the other), ``difference`` (``reference`` minus the other, a row a case).
         reference: the method compared.
-        unit: what the difference is of, for the axis.
+        what: what the difference is of, for the title.
         note: where the patient is from.
 
     Raises:
@@ -355,7 +409,7 @@ def paired_differences(df: pd.DataFrame, reference: str, unit: str, *, note: str
     _table(df, ("dataset", "method", "difference"), "paired differences")
     datasets, methods = list(dict.fromkeys(df["dataset"])), in_order(df["method"])
     label = method_style(reference).label
-    figure = new_figure(1.6 + 0.36 * len(methods), f"{label} against each other method, case by case ({note})")
+    figure = new_figure(1.6 + 0.36 * len(methods), f"{what}: {label} minus each other method ({note})")
     panels = np.atleast_1d(figure.subplots(1, len(datasets), sharex=True, sharey=True))
     for ax, dataset in zip(panels, datasets, strict=True):
         mine = df[df["dataset"] == dataset]
@@ -371,7 +425,9 @@ def paired_differences(df: pd.DataFrame, reference: str, unit: str, *, note: str
         ax.axvline(0, color=DARK, lw=1)
         ax.grid(axis="x", alpha=0.3)
         plain(ax, f"{dataset}, n = {mine.groupby('method').size().max()} cases")
-        ax.set_xlabel(f"{label} better ←  {unit}  → worse", fontsize=8)
+        ax.set_xlabel("difference (mm)", fontsize=8)
+    how = f"{label} better ←  → worse.  Dot: a case; bar: mean ± population SD over cases"
+    figure.supxlabel(how, fontsize=8, color=DARK)
     panels[0].set_yticks(range(len(methods)), [method_style(method).label for method in methods])
     panels[0].set_ylim(len(methods) - 0.5, -0.5)
     return figure

@@ -8,7 +8,7 @@ right; methods have one colour and marker each, as tuned solid and as shipped li
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 from zlib import crc32
@@ -26,6 +26,7 @@ from PIL import Image
 
 from study.errors import StudyError
 from study.geometry import nearest
+from study.metrics import TRUTH
 from study.types import (
     CARTILAGES,
     Floats,
@@ -119,6 +120,8 @@ METHOD_STYLE: Mapping[str, MethodStyle] = {  # Paul Tol's vibrant scheme, safe f
     **_styles("nonrigid_icp", "Non-rigid ICP", "#EE7733", "s"),
     **_styles("cpd", "CPD", "#009988", "^"),
     **_styles("skeleton_graph", "Skeleton graph", "#CC3311", "D"),
+    # No method: the known deformation, judged like one.
+    TRUTH: MethodStyle("Perfect (truth)", "#222222", "*", tuned=True),
 }
 
 
@@ -286,11 +289,13 @@ def below(figure: Figure, handles: Sequence[Any], columns: int) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
 
 
-def part_legend(figure: Figure, extra: Sequence[Any] = ()) -> None:
-    """Levels and sides below the figure."""
-    handles = [Patch(color=colour, label=f"cartilage {level}") for level, colour in LEVEL_COLOUR.items()]
-    handles = [Patch(color=GREY, label="sternum"), *handles]
-    handles.append(Patch(color=PART_COLOUR[Part.LEFT_2], label="patient's left: lighter"))
+def part_legend(figure: Figure, extra: Sequence[Any] = (), shown: Collection[Part] = tuple(Part)) -> None:
+    """Levels and sides below the figure, those of the parts ``shown``."""
+    handles = [Patch(color=GREY, label="sternum")] if Part.STERNUM in shown else []
+    levels = {part.level for part in shown if part in CARTILAGES}
+    handles += [Patch(color=LEVEL_COLOUR[level], label=f"cartilage {level}") for level in sorted(levels)]
+    left = [part for part in CARTILAGES if part in shown and part.side == "left"]
+    handles += [Patch(color=PART_COLOUR[part], label="patient's left: lighter") for part in left[:1]]
     below(figure, [*handles, *extra], 6 if not extra else 5)
 
 

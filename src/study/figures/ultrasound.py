@@ -68,7 +68,7 @@ def sweep_in_space(
     extents = [bounds(project(every, view, T_cloud_chest)) for view in views]
     ratios = [float(np.divide(*np.ptp(extent, axis=0))) for extent in extents]
     tall = float(np.clip((WIDTH_IN - 2.4) / sum(ratios) + 1.3, 3.4, 7.5))
-    figure = new_figure(tall, f"{cloud.name}: the sweep in space")
+    figure = new_figure(tall, f"Virtual sweep of {cloud.name.rpartition(':')[2]}")
     panels = figure.subplots(1, 2, width_ratios=ratios)
     drawn: Any = None
     for ax, view, extent, title in zip(panels, views, extents, ("from the front", "from the right"), strict=True):

@@ -59,7 +59,7 @@ class Cpd:
     @classmethod
     def tuned(cls) -> Cpd:
         """The best row of ``results/tuning/cpd.csv``, found on development subjects by tools/tune.py."""
-        return cls(alpha=0.2, beta_mm=80.0)
+        return cls(alpha=0.2, beta_mm=30.0)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Drift ``source`` onto ``target``; nothing is drawn from ``rng``.

@@ -46,7 +46,7 @@ class Icp:
     @classmethod
     def tuned(cls) -> Icp:
         """The best row of ``results/tuning/icp.csv``, found on development subjects by tools/tune.py."""
-        return cls(max_distance_mm=7.0, max_iterations=200)
+        return cls(max_distance_mm=2.0, max_iterations=200)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Fit ``source`` to ``target`` rigidly; nothing is drawn from ``rng``.

@@ -65,7 +65,7 @@ class SkeletonGraphMethod:
             T_us_ct=RigidTransform(),
             converged=max(falls) < MAX_FALL,
             n_iterations=self.ct_som.epochs + self.us_som.epochs,
-            stop_reason="both maps ran their schedule; at its end their errors fell by {:.1%} and {:.1%}".format(*falls),
+            stop_reason="schedules done; at their ends the maps' errors fell by {:.1%} and {:.1%}".format(*falls),
             history=(*ct_history, *us_history),
             seconds=time.perf_counter() - start,
             method=self.name,
