@@ -229,7 +229,7 @@ CHOICES = [
     (
         "sphere of path transfer (§III-D)",
         f"{radius_mm:g} mm",
-        [("15 mm", "alternative", method, 15.0), ("40 mm", "alternative", method, 40.0)],
+        [("30 mm", "alternative", method, 30.0), ("40 mm", "alternative", method, 40.0)],
     ),
 ]
 visible = [("what a probe can see", "alternative", VisibleSurface(method), radius_mm)]

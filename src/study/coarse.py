@@ -20,7 +20,7 @@ MIN_BEND_RATIO = 1.5  # sound clouds have 3 and more; where strips cut ends off 
 # What tells eight cartilages from eight pieces of something else. On 251 whole clouds of development and real people:
 # offset 11 or less, apart 14 or more, length 15 or more, touch 0.21 or less, fill 0.47 or less.
 MIN_APART_MM = 12.0  # between the roots of neighbours
-MIN_LENGTH_MM = 15.0  # beside the sternum
+MIN_LENGTH_MM = 12.0  # beside the sternum
 BESIDE_MM = 20.0  # from the sternum's edge: where neighbours that are two cartilages are apart
 TOUCH_MM = 4.0
 MAX_TOUCH = 0.3  # share of a root that close to its neighbour; two halves of one cartilage have 0.38 or more
