@@ -104,6 +104,7 @@ decisions = pd.DataFrame(
             **{f"angle at {fit.scale_mm:g} mm (°)": fit.angle_deg for fit in chest.search.fit.searches},
             "sternum's edges (mm)": " and ".join(f"{edge:.0f}" for edge in chest.search.branches.half_widths_mm),
             "bend, 5th over 2nd": chest.bend_ratio,
+            "length, 5th over 2nd": chest.length_ratio,
             "arch to the front (mm)": chest.bulge_mm,
             "points without a part": int((chest.cloud.parts == Part.UNKNOWN).sum()),
         }

@@ -93,6 +93,20 @@ def test_branches_that_face_gaps_are_refused(ct_clouds):
         find_chest(torn)
 
 
+def test_a_bend_that_the_lengths_contradict_is_refused(ct_clouds):
+    """Shifted lines of a sweep bend any cartilage; a chest called upside down by its bend would look plausible."""
+    cloud = ct_clouds["ct2"]
+    points = cloud.points.copy()
+    middle = cloud.only(Part.STERNUM)[:, 0].mean()
+    for part in (Part.LEFT_2, Part.RIGHT_2):  # a parabola of 15 mm in the feature plane
+        mine = cloud.parts == part
+        along = np.abs(points[mine, 0] - middle)
+        t = (along - along.min()) / np.ptp(along)
+        points[mine, 2] += 60.0 * t * (1 - t)
+    with pytest.raises(StudyError, match=r"bent: expected 5th cartilages, those that bend most, .* head and foot"):
+        find_chest(PointCloud(points, "bent"))
+
+
 def test_a_flat_chest_needs_its_front(ct_clouds):
     cloud = ct_clouds["ct1"]
     flat = cloud.points * [1, 0, 1]
