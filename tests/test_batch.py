@@ -173,7 +173,7 @@ def test_the_planted_source_is_read_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
     def load(dataset: str, name: str, *rest: Any) -> Anatomy:
         read.append((dataset, name))
-        return replace(load_anatomy("phantom", "ct3", *rest), name=name)
+        return replace(load_anatomy("phantom", "ct3", *rest), name=name)  # at 3 mm ct1 planted is refused
 
     monkeypatch.setattr(batch, "load_anatomy", load)
     monkeypatch.setattr(batch, "fetch_subject", lambda *_: None)

@@ -46,6 +46,27 @@ def test_planted_branches_get_their_numbers_across_a_missing_strip_too(gap_mm):
         assert (np.diff(side[:, 1]) > 15).all()
 
 
+@pytest.mark.parametrize(("seed", "slope", "strip", "short"), [(303, 0.7, (19, 26), 26.0), (458, 1.1, (18, 27), 25.0)])
+def test_a_strip_missed_beside_the_sternum_does_not_cost_a_branch(seed, slope, strip, short):
+    """It leaves little of a short branch while a steep one fills many rows: only some bands, and starts from the gaps,
+    show four roots that face those of the other side."""
+    rng = np.random.default_rng(seed)
+    points, numbers = [rng.uniform([-15, -46], [15, 46], (4000, 2))], [np.zeros(4000)]
+    for s, side in enumerate((-1, 1)):
+        for k, row in enumerate(ROWS):
+            end, rise = short if k == 0 else 70, slope if k == 3 else 0.15
+            along = rng.uniform(15, end, int(600 * (end - 15) / 55))
+            bar = np.column_stack([side * along, row + (along - 15) * rise + rng.uniform(-5, 5, len(along))])
+            if side == 1:
+                bar = bar[(bar[:, 0] < strip[0]) | (bar[:, 0] > strip[1])]
+            points.append(bar)
+            numbers.append(np.full(len(bar), 1 + 4 * s + k))
+    cloud, true = np.concatenate(points), np.concatenate(numbers)
+    found = find_branches(cloud, 90.0)
+    beyond = np.abs(cloud[:, 0]) > max(found.half_widths_mm) + 2
+    assert np.mean(found.branch[beyond] == true[beyond]) > 0.99
+
+
 def test_a_piece_far_from_every_branch_belongs_to_none():
     points, _ = drawing()
     island = np.random.default_rng(1).uniform([95, 80], [105, 90], (100, 2))

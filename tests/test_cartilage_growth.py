@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from phantom_files import ribseg_labels, scan, structure_ids
 
 from study.cartilage_growth import parts_from_landmarks, parts_from_ribs, rib_ends
 from study.chest_wall import anterior_wall_image
-from study.ct import rib_name
+from study.ct import on_grid, parts_from_labels, rib_name
 from study.data.landmarks import Landmarks, read_landmarks
 from study.data.manifest import load_manifest
 from study.errors import StudyError
@@ -199,3 +200,12 @@ def test_flattened_wall_gives_depth_under_a_pick(drawn: tuple[Volume, Volume, np
         wall.pick(900.0, 0.0)
     with pytest.raises(StudyError, match="expected lungs"):
         anterior_wall_image(ct.with_values(np.full(ct.shape, 50, np.int16)))
+
+
+def test_the_sternum_of_a_round_chest_is_found_ahead_of_its_rib_ends() -> None:
+    """Of this phantom the sternum lies more than the search's 14 mm in front of the plane through the rib ends."""
+    image, labels = scan("ct5")
+    found = on_grid(parts_from_ribs(image, ribseg_labels(labels), IDS), labels)
+    truth = on_grid(parts_from_labels(labels, structure_ids()), labels)
+    a, b = (volume.values > Part.UNKNOWN for volume in (found, truth))
+    assert 2 * (a & b).sum() / (a.sum() + b.sum()) > 0.8

@@ -1,10 +1,21 @@
 """From any rigid pose: the right axes, sides and levels, or an error; never a mirrored or shifted anatomy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from study import phantom
-from study.coarse import Alignment, Chest, align, chest_frame, find_chest
+from study.coarse import (
+    MAX_TOUCH,
+    Alignment,
+    Chest,
+    _check_roots,
+    align,
+    chest_frame,
+    find_chest,
+    measure_roots,
+)
 from study.errors import StudyError
 from study.types import CARTILAGES, Part, PointCloud, RigidTransform
 
@@ -87,10 +98,27 @@ def test_a_missing_part_is_an_error(name, part, ct_clouds, us_cloud):
 
 
 def test_branches_that_face_gaps_are_refused(ct_clouds):
-    cloud = ct_clouds["ct5"]
+    cloud = ct_clouds["ct4"]
     torn = PointCloud(cloud.points[cloud.parts != Part.RIGHT_5], "torn")
-    with pytest.raises(StudyError, match=r"expected (four|4 separate) cartilages .*; is a branch missing"):
+    with pytest.raises(StudyError, match=r"four cartilages a side that leave the sternum in pairs.* mm; is a branch"):
         find_chest(torn)
+
+
+def test_two_halves_of_one_cartilage_are_not_two(ct_clouds):
+    """Eight labels in the right places are not eight cartilages where two of them share one."""
+    chest = find_chest(unlabelled(ct_clouds["ct4"], RigidTransform()))
+    branches, local = chest.search.branches, chest.search.local
+    whole = measure_roots(branches, local)
+    assert whole == chest.search.roots
+    assert whole.touch < MAX_TOUCH / 2
+    # The upper half of one branch goes to the next one above it.
+    split = branches.branch.copy()
+    mine = split == 6
+    split[mine & (local[:, 1] > np.median(local[mine, 1]))] = 7
+    halves = measure_roots(replace(branches, branch=split), local)
+    assert halves.touch > MAX_TOUCH
+    with pytest.raises(StudyError, match=r"split: expected cartilages apart from each other .* is a branch missing"):
+        _check_roots(halves, "split")
 
 
 def test_a_bend_that_the_lengths_contradict_is_refused(ct_clouds):

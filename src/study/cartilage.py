@@ -17,7 +17,7 @@ from study.types import Bools, Floats, Ints
 
 PIXEL_MM = 1.0
 BANDS_MM = ((2.0, 14.0), (6.0, 18.0), (10.0, 22.0), (14.0, 26.0), (2.0, 26.0))  # outwards from the sternum's edge
-MIN_SPACE_MM = 4.0  # between neighbouring cartilages beside the sternum; they are 8 mm and more apart
+MIN_SPACE_MM = 4.0  # between neighbouring cartilages beside the sternum; narrower gaps are holes of the sampling
 MAX_OFFSET_MM = 15.0  # along the sternum between the two roots of a level; a missing branch shifts by a level, 20-35
 GAP_COST = 3.0  # of crossing an empty pixel, against 1 along a cartilage
 MAX_GAP_MM = 20.0  # a piece farther than this from every branch belongs to none

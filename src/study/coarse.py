@@ -16,17 +16,33 @@ from study.types import CARTILAGES, ChestFrame, Floats, Part, PointCloud, RigidT
 
 MIN_BULGE_MM = 0.2
 HALF_MM = 6.0  # half the width of a cartilage
-# The 5th cartilages, found by their bend, over the 2nd: on 190 clouds of development people 1.27 or more where the bend
-# was right, 0.79 or less where it was wrong, as in half of the sweeps with a latency left in.
-MIN_LENGTH_RATIO = 1.1
-# What tells eight cartilages from eight pieces of something else. On 251 whole clouds of development and real people:
-# offset 11 or less, apart 14 or more, length 15 or more, touch 0.21 or less, fill 0.47 or less.
+# The limits below stand between whole clouds and torn or shifted ones; benchmarks/coarse_margins.py prints by how much.
+MIN_LENGTH_RATIO = 1.1  # of the 5th cartilages, found by their bend, over the 2nd; below 1 the bend was wrong
 MIN_APART_MM = 12.0  # between the roots of neighbours
 MIN_LENGTH_MM = 12.0  # beside the sternum
 BESIDE_MM = 20.0  # from the sternum's edge: where neighbours that are two cartilages are apart
 TOUCH_MM = 4.0
-MAX_TOUCH = 0.3  # share of a root that close to its neighbour; two halves of one cartilage have 0.38 or more
-MAX_FILL = 0.6  # density of points between neighbours over that on them; a plate has 0.85 or more
+MAX_TOUCH = 0.3  # share of a root that close to its neighbour: more are two halves of one cartilage
+MAX_FILL = 0.6  # density of points between neighbours over that on them; a plate has about 1
+
+
+@dataclass(frozen=True)
+class RootMeasures:
+    """What tells eight cartilages from eight pieces of something else.
+
+    Attributes:
+        offset_mm: largest distance along the sternum between the two roots of a level.
+        apart_mm: smallest distance between the roots of neighbours.
+        shortest_mm: reach of the shortest branch from the sternum's edge.
+        touch: largest share of a root within ``TOUCH_MM`` of its neighbour.
+        fill: density of points between the roots over that on them.
+    """
+
+    offset_mm: float
+    apart_mm: float
+    shortest_mm: float
+    touch: float
+    fill: float
 
 
 @dataclass(frozen=True)
@@ -38,12 +54,14 @@ class ChestSearch:
         fit: the rectangle there, with those of the coarser scales.
         local: (n, 2) mm, the cloud in sternum coordinates, y along the symmetry axis.
         branches: sternum edges, seeds and branches in ``local``.
+        roots: by which the branches were taken for cartilages.
     """
 
     plane: Floats
     fit: SternumFit
     local: Floats
     branches: Branches
+    roots: RootMeasures
 
 
 @dataclass(frozen=True)
@@ -152,13 +170,14 @@ def _sternum_with_branches(flat: Floats, params: SternumParams, name: str) -> tu
         local = T_plane_sternum.inverse.apply(lifted)[:, :2]
         try:
             branches = find_branches(local, params.height_mm, name)
-            _check_branches(branches, local, name)
+            roots = measure_roots(branches, local)
+            _check_roots(roots, name)
         except StudyError as error:
             first_error = first_error or error
             continue
         # The rectangle slides along a longer or shorter sternum; the eight attachments do not.
         along = np.array([0.0, branches.seeds[:, 1].mean()])
-        return ChestSearch(flat, fit, local, branches), T_plane_sternum @ _turn(0.0, along)
+        return ChestSearch(flat, fit, local, branches, roots), T_plane_sternum @ _turn(0.0, along)
     if first_error is not None:
         raise first_error
     raise StudyError(
@@ -167,35 +186,42 @@ def _sternum_with_branches(flat: Floats, params: SternumParams, name: str) -> tu
     )
 
 
-def _check_branches(branches: Branches, local: Floats, name: str) -> None:
-    """Refuse eight pieces that are no cartilages: a rectangle laid askew can find four a side where one is missing."""
+def measure_roots(branches: Branches, local: Floats) -> RootMeasures:
+    """Measure where the branches leave the sternum; ``local`` (n, 2) mm are their points in sternum coordinates."""
     roots = branches.seeds[:, 1].reshape(2, 4)
-    offset = float(np.abs(roots[0] - roots[1]).max())
-    apart = float(np.diff(roots, axis=1).min())
-    shortest = float(_lengths_mm(branches, local).min())
-    if offset > MAX_OFFSET_MM or apart < MIN_APART_MM or shortest < MIN_LENGTH_MM:
-        raise StudyError(
-            f"{name}: expected four cartilages a side that leave the sternum in pairs (up to {MAX_OFFSET_MM:g} mm), at "
-            f"least {MIN_APART_MM:g} mm apart and {MIN_LENGTH_MM:g} mm long, got {offset:.0f}, {apart:.0f} and "
-            f"{shortest:.0f} mm; is a branch missing, or does the cloud hold more than cartilages 2-5?"
-        )
     beside_sternum = (local[:, 0] > -branches.half_widths_mm[0] - BESIDE_MM) & (
         local[:, 0] < branches.half_widths_mm[1] + BESIDE_MM
     )
     roots_of = [local[(branches.branch == k) & beside_sternum] for k in range(1, 9)]
     neighbours = [pair for side in (roots_of[:4], roots_of[4:]) for pair in pairwise(side)]
-    touch = max(max(_share_near(one, other), _share_near(other, one)) for one, other in neighbours)
-    if touch > MAX_TOUCH:
-        raise StudyError(
-            f"{name}: expected cartilages apart from each other beside the sternum, got {touch:.2f} of one within "
-            f"{TOUCH_MM:g} mm of the next, need {MAX_TOUCH:g} or less; is a branch missing?"
-        )
     seeds = branches.seeds.reshape(2, 4, 2)
     between = (seeds[:, :-1] + seeds[:, 1:]) / 2
-    fill = _count_near(local, between).mean() / max(_count_near(local, seeds).mean(), 1e-9)
-    if fill > MAX_FILL:
+    return RootMeasures(
+        offset_mm=float(np.abs(roots[0] - roots[1]).max()),
+        apart_mm=float(np.diff(roots, axis=1).min()),
+        shortest_mm=float(_lengths_mm(branches, local).min()),
+        touch=max(max(_share_near(one, other), _share_near(other, one)) for one, other in neighbours),
+        fill=float(_count_near(local, between).mean() / max(_count_near(local, seeds).mean(), 1e-9)),
+    )
+
+
+def _check_roots(found: RootMeasures, name: str) -> None:
+    """Refuse eight pieces that are no cartilages: a rectangle laid askew can find four a side where one is missing."""
+    if found.offset_mm > MAX_OFFSET_MM or found.apart_mm < MIN_APART_MM or found.shortest_mm < MIN_LENGTH_MM:
         raise StudyError(
-            f"{name}: expected open spaces between the cartilages, got {fill:.2f} of their own density there, "
+            f"{name}: expected four cartilages a side that leave the sternum in pairs (up to {MAX_OFFSET_MM:g} mm), at "
+            f"least {MIN_APART_MM:g} mm apart and {MIN_LENGTH_MM:g} mm long, got {found.offset_mm:.0f}, "
+            f"{found.apart_mm:.0f} and {found.shortest_mm:.0f} mm; is a branch missing, or does the cloud hold more "
+            "than cartilages 2-5?"
+        )
+    if found.touch > MAX_TOUCH:
+        raise StudyError(
+            f"{name}: expected cartilages apart from each other beside the sternum, got {found.touch:.2f} of one in "
+            f"reach ({TOUCH_MM:g} mm) of the next, need {MAX_TOUCH:g} or less; is a branch missing?"
+        )
+    if found.fill > MAX_FILL:
+        raise StudyError(
+            f"{name}: expected open spaces between the cartilages, got {found.fill:.2f} of their own density there, "
             f"need {MAX_FILL:g} or less; crop to sternum and cartilages of ribs 2-5"
         )
 

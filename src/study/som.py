@@ -146,7 +146,7 @@ def late_fall(history: tuple[float, ...]) -> float:
     """Share by which the quantisation error still fell from the third last check of `fit_som` to the last.
 
     A map at rest has less than ``MAX_FALL``. The schedule's length is fixed, so this is the test of convergence: one
-    too short ends while its error falls, whatever its rate.
+    too short ends while its error falls. A map whose rate has died is at rest, too, wherever it lies.
     """
     return 1 - history[-1] / history[-3] if len(history) >= 3 else 1.0
 
