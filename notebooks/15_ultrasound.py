@@ -128,7 +128,7 @@ figures.frame_with_mask(
 
 # %% [markdown]
 # ## The sweep in space
-# Lines from head to foot and back over the skin, the transducer drawn in some frames, and the cloud they give over the
+# Lines up and down the body over the skin, the transducer drawn in some frames, and the cloud they give over the
 # surface that was scanned, in the frame of the tracker (turned here to look from the front). The cloud lies on the
 # front of the cartilages only, and has gaps between lines.
 
