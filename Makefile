@@ -27,9 +27,8 @@ $(STAMP): environment.lock pyproject.toml tools/setup.sh tools/check_system.py
 	@touch $@
 
 study: $(STAMP)  ## run the whole study; prints the tables and where the figures are
-	$(BIN)/study run --dataset phantom --jobs $(JOBS) --out $(RUNS)/phantom
-	$(BIN)/study run --dataset open --jobs $(JOBS) --out $(RUNS)/open
-	$(BIN)/study run --dataset planted --jobs $(JOBS) --out $(RUNS)/planted
+	for dataset in $$($(BIN)/study datasets --reported); do \
+	  $(BIN)/study run --dataset $$dataset --jobs $(JOBS) || exit 1; done
 	$(BIN)/python tools/notebooks.py run --jobs $(JOBS) --out $(RUNS)/notebooks
 	$(BIN)/study report $(RUNS)
 
@@ -48,7 +47,7 @@ notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
 	$(BIN)/python tools/notebooks.py write --jobs $(JOBS)
 
 reference: $(STAMP)  ## renew results/reference from results/runs (a CHANGELOG entry says why)
-	for d in phantom open planted; do \
+	for d in $$($(BIN)/study datasets --reported); do \
 	  rm -rf results/reference/$$d && cp -r $(RUNS)/$$d results/reference/$$d; done
 	$(BIN)/study anatomy --dataset open --out results/anatomy.csv
 	$(BIN)/python tools/readme.py write

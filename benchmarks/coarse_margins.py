@@ -4,7 +4,7 @@
 
 Phantoms of the development seeds 101, 102, ... (none is reported), each as a CT cloud and as virtual sweeps with every
 error on, without and with the latency left in; and as a CT cloud and a sweep with one part torn out, which must be
-refused. Right means as in pose_rate.py. The last lines are what the limits in `study.coarse` stand between, and how far
+refused. Right means as in pose_rate.py. The last lines are what the limits of `study.alignment` stand between, how far
 a sweep lies from the surface that a probe can see.
 """
 
@@ -19,13 +19,17 @@ from joblib import Parallel, delayed
 from pose_rate import is_right
 
 from study import phantom
-from study.coarse import find_chest
-from study.cohorts import FRONT, make_patient, phantom_anatomy
+from study.alignment.chest import find_chest
+from study.data.manifest import load_manifest
+from study.datasets.people import FRONT, make_patient
+from study.datasets.phantoms import PhantomDataset
 from study.errors import StudyError
+from study.geometry.rays import surface_distance_mm
 from study.params import find_profile
-from study.pipeline import named_rng
-from study.sweep import LATENCY_S, SweepErrors, surface_distance_mm, visible_mesh
+from study.seeds import named_rng
 from study.types import Part, PointCloud, RigidTransform
+from study.ultrasound.sweep_errors import LATENCY_S, SweepErrors
+from study.ultrasound.visible import visible_mesh
 
 FIRST_SEED = 101
 PARTS = [part for part in Part if part != Part.UNKNOWN]
@@ -35,7 +39,7 @@ def outcomes(name: str, seed: int) -> tuple[list[tuple[str, str]], list[dict[str
     """(kind, outcome) of every cloud of one person; margins of the whole ones; mm from sweep to visible surface."""
     params = replace(find_profile("full"), ct_points=4000)
     rng = named_rng(seed, f"margins/{name}")
-    anatomy = phantom_anatomy(name, seed, params)
+    anatomy = PhantomDataset("phantom", params, 0, load_manifest(), cohort_seed=seed).anatomy(name)
     late = replace(SweepErrors(), latency_uncorrected_s=LATENCY_S)
     swept, shifted = make_patient(anatomy, params, seed), make_patient(anatomy, params, seed, late)
     clouds = {

@@ -18,11 +18,12 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from study.cartilage_growth import parts_from_ribs
-from study.ct import on_grid, parts_from_labels, surface
+from study.ct.growth import parts_from_ribs
+from study.ct.parts import on_grid, parts_from_labels
+from study.ct.surface import surface
 from study.data.fetch import fetch
 from study.data.manifest import load_manifest
-from study.data.volumes import read_labels, read_volume
+from study.files.volumes import read_labels, read_volume
 from study.types import CARTILAGES, Bools, Mesh, Part, Volume
 
 

@@ -15,8 +15,9 @@ from threadpoolctl import threadpool_limits
 
 from study import METHODS, phantom, register_pair
 from study.params import PHANTOM_SEED
-from study.som import SomParams, fit_som, neighbourhood
-from study.types import PointCloud, SkeletonGraph
+from study.skeleton.graph import SkeletonGraph
+from study.skeleton.som import SomParams, fit_som, neighbourhood
+from study.types import PointCloud
 
 
 def processor_seconds(run: Callable[[], object], repeats: int = 3) -> float:

@@ -12,9 +12,13 @@ import time
 
 import numpy as np
 
-from study.sweep import Probe, SweepErrors, simulate_sweep, surface_distance_mm, visible_mesh
+from study.geometry.rays import surface_distance_mm
 from study.types import Floats, Mesh
-from study.us import sweep_cloud
+from study.ultrasound.cloud import sweep_cloud
+from study.ultrasound.probe import Probe
+from study.ultrasound.sweep_errors import SweepErrors
+from study.ultrasound.virtual_sweep import simulate_sweep
+from study.ultrasound.visible import visible_mesh
 
 FRONT = (0.0, 1.0, 0.0)
 

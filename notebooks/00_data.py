@@ -18,20 +18,13 @@ seed = 0
 import numpy as np
 import pandas as pd
 
-from study import cohorts, figures, phantom
-from study import params as profiles
-from study.ct import on_grid
-from study.data.fetch import data_list, fetch_all, verify_all
-from study.data.manifest import load_manifest
-from study.errors import StudyError
-from study.geometry import fit_rigid
-from study.metrics import point_errors_mm, population_sd
-from study.types import Part
+from study import ct, data, datasets, figures, params, phantom
 
-profiles.check_parameters(globals(), dataset=str, profile=str, seed=int)
-params = profiles.find_profile(profile)
+params.check_parameters(globals(), dataset=str, profile=str, seed=int)
+settings = params.find_profile(profile)
+chosen = datasets.find_dataset(dataset, settings, seed)
 pd.options.display.max_colwidth = None
-manifest = load_manifest()
+manifest = chosen.manifest
 
 # %% [markdown]
 # ## The cohorts
@@ -40,30 +33,18 @@ manifest = load_manifest()
 
 # %%
 roles = {"any": "each in turn is the patient", "ct": "CT", "patient": "patient"}
-listing = pd.DataFrame(
-    [
-        {
-            "cohort": name,
-            "what": cohort.title,
-            "CTs": "generated" if cohort.kind == "generated" else "real",
-            "ultrasound": "simulated",
-            "subjects": ", ".join(cohort.subjects),
-            "who plays what": ", ".join(dict.fromkeys(roles[subject.role] for subject in cohort.subjects.values())),
-        }
-        for name, cohort in manifest.cohorts.items()
-    ]
-    + [
-        {
-            "cohort": "planted",
-            "what": f"{cohorts.PLANTED_SOURCE[1]} under smooth deformations that are known",
-            "CTs": "real",
-            "ultrasound": "simulated",
-            "subjects": ", ".join([cohorts.PLANTED_SOURCE[1], *cohorts.PLANTED_SIZES_MM]),
-            "who plays what": "CT, the planted ones are patients",
-        }
-    ]
-).set_index("cohort")
-listing
+origins = {"real": "real", "synthetic": "generated"}
+listing = {}
+for name, cohort in manifest.cohorts.items():
+    whole = datasets.find_dataset(name, settings, seed)
+    listing[name] = {
+        "what": whole.title,
+        "CTs": origins[whole.people],
+        "ultrasound": "simulated",
+        "subjects": ", ".join(cohort.subjects),
+        "who plays what": ", ".join(dict.fromkeys(roles[subject.role] for subject in cohort.subjects.values())),
+    }
+pd.DataFrame.from_dict(listing, orient="index").rename_axis("cohort")
 
 # %% [markdown]
 # ## Where each file comes from
@@ -71,7 +52,7 @@ listing
 
 # %%
 shown = [name for name, cohort in manifest.cohorts.items() if cohort.kind == "files"]
-files = pd.concat([data_list(manifest, name) for name in shown]).drop_duplicates("file")
+files = pd.concat([data.data_list(manifest, name) for name in shown]).drop_duplicates("file")
 files = files[files["role"].isin(["ct", "labels"]) & ~files["file"].str.contains("/")]
 entries = [manifest.file(key) for key in files["file"]]
 pd.DataFrame(
@@ -94,12 +75,8 @@ pd.DataFrame(
 # phantom needs no file.
 
 # %%
-real = {"open": "open", "planted": cohorts.PLANTED_SOURCE[0]}.get(dataset)
-if real is None:
-    checked = pd.DataFrame(columns=["subject", "file", "status"])
-else:
-    fetch_all(manifest, real, progress=False)
-    checked = verify_all(manifest, real)
+data.fetch_all(manifest, chosen.file_cohort, progress=False)
+checked = data.verify_all(manifest, chosen.file_cohort)
 checked.set_index("subject")[["file", "status"]]
 
 # %% [markdown]
@@ -110,20 +87,17 @@ checked.set_index("subject")[["file", "status"]]
 # real ones; they look smoother than anybody is.
 
 # %%
-wanted = {"open": list(manifest.cohort("open").subjects), "planted": [cohorts.PLANTED_SOURCE[1]]}.get(dataset, [])
-wanted = [("open", name) for name in wanted] + [("phantom", name) for name in phantom.SUBJECTS]
-if profile == "quick":  # one real, one synthetic
-    wanted = [next(pair for pair in wanted if pair[0] == cohort) for cohort in dict(wanted)]
+made, planted = (datasets.find_dataset(name, settings, seed) for name in ("phantom", "planted"))
+wanted = [(chosen, chosen.with_ct())]
+if chosen.people == "real":  # two synthetic people beside them
+    wanted.append((made, [made.sources()[0], made.targets()[0]]))
 people, left_out = {}, []
-for cohort, name in wanted:
-    if cohort == "phantom" and dataset != "phantom" and name not in ("ct1", "patient"):
-        continue
-    try:
-        people[f"{cohort}: {name}"] = cohorts.load_anatomy(cohort, name, params, seed)
-    except StudyError as error:
-        left_out.append(f"{cohort}: {name} is not shown: {error}")
+for whole, names in wanted:
+    found, reasons = whole.anatomies(names[:1] if profile == "quick" else names)  # quick: one real, one synthetic
+    people |= {f"{whole.file_cohort}: {name}": one for name, one in found.items()}
+    left_out += [f"{whole.file_cohort}: {name} is not shown: {reason}" for name, reason in reasons.items()]
 print("\n".join(left_out) or f"{len(people)} people, none left out")
-figures.anatomy_overview({name: (one.image, on_grid(one.mask, one.image)) for name, one in people.items()})
+figures.anatomy_overview({name: (one.image, ct.on_grid(one.mask, one.image)) for name, one in people.items()})
 
 # %% [markdown]
 # ## The phantom's numbers beside those they are drawn from
@@ -133,7 +107,7 @@ figures.anatomy_overview({name: (one.image, on_grid(one.mask, one.image)) for na
 # (`results/anatomy.csv`, made as in notebook 10). All in mm but the angle.
 
 # %%
-drawn = {name: phantom.draw_subject(name, profiles.PHANTOM_SEED) for name in phantom.SUBJECTS}
+drawn = {name: phantom.draw_subject(name, params.PHANTOM_SEED) for name in phantom.SUBJECTS}
 sizes = pd.DataFrame({name: phantom.measures(one) for name, one in drawn.items()})
 mean_of = {f"cartilage, rib {k}": sizes.filter(regex=f"cartilage_.*_{k}_mm", axis=0).mean() for k in (2, 3, 4, 5)}
 table = pd.DataFrame(
@@ -145,15 +119,17 @@ table = pd.DataFrame(
     }
 ).T
 published = {
-    "manubrium": phantom.MANUBRIUM_MM,
-    "body of the sternum": phantom.BODY_MM,
-    "sternal angle (°)": ((phantom.STERNAL_ANGLE_DEG,),),
-    **{f"cartilage, rib {k}": (mean_sd,) for k, mean_sd in phantom.CARTILAGE_MM.items()},
+    "manubrium": phantom.sizes.MANUBRIUM_MM,
+    "body of the sternum": phantom.sizes.BODY_MM,
+    "sternal angle (°)": ((phantom.sizes.STERNAL_ANGLE_DEG,),),
+    **{f"cartilage, rib {k}": (mean_sd,) for k, mean_sd in phantom.sizes.CARTILAGE_MM.items()},
 }
-measured = {f"cartilage, rib {k}": (mean_sd,) for k, mean_sd in phantom.MEASURED_LENGTH_MM.items()}
+measured = {f"cartilage, rib {k}": (mean_sd,) for k, mean_sd in phantom.sizes.MEASURED_LENGTH_MM.items()}
 drawn_from = measured | published
+
+# %%
 compared = table.round(1)
-compared["mean ± SD"] = [f"{row.mean():.1f} ± {population_sd(row):.1f}" for _, row in table.iterrows()]
+compared["mean ± SD"] = [f"{row.mean():.1f} ± {row.std(ddof=0):.1f}" for _, row in table.iterrows()]
 compared["drawn from"] = [
     ", ".join(" ± ".join(f"{value:g}" for value in one) for one in drawn_from[name]) for name in table.index
 ]
@@ -170,13 +146,13 @@ apart = {}
 for name, one in drawn.items():
     if name != "patient":
         there = phantom.truth_map(drawn["patient"], one, surface)
-        apart["phantom", f"{name} to patient"] = point_errors_mm(fit_rigid(there, surface).apply(there), surface).mean()
-source = people.get(f"open: {cohorts.PLANTED_SOURCE[1]}")
+        apart["phantom", f"{name} to patient"] = phantom.residual_mm(there, surface)
+origin = planted.sources()[0]
+source = people.get(f"{planted.file_cohort}: {origin}")
 if source is not None:
-    for name in cohorts.PLANTED_SIZES_MM:
-        there = cohorts.plant(source, name).mesh.vertices
-        rigid = fit_rigid(source.mesh.vertices, there).apply(source.mesh.vertices)
-        apart["planted", f"{cohorts.PLANTED_SOURCE[1]} to {name}"] = point_errors_mm(rigid, there).mean()
+    for name in datasets.planted.SIZES_MM:
+        there = planted.anatomy(name, source).mesh.vertices
+        apart["planted", f"{origin} to {name}"] = phantom.residual_mm(source.mesh.vertices, there)
 apart = pd.Series(apart, name="apart after a rigid fit (mm)").round(2)
 apart.to_frame()
 
@@ -186,24 +162,26 @@ apart.to_frame()
 # and as different from each other, as they claim.
 
 # %%
-if real is not None:
+if chosen.people == "real":
     assert (checked["status"] == "verified").all(), f"files that are not what the manifest says:\n{checked}"
-    assert len(checked) >= len(manifest.cohort(real).subjects), "expected a file for every subject"
+    assert len(checked) >= len(chosen.with_ct()), "expected a file for every subject"
 assert people, "expected at least one person to look at"
 for name, one in people.items():
-    parts = set(np.unique(one.mask.values)) - {Part.UNKNOWN}
-    assert parts == set(Part) - {Part.UNKNOWN}, f"{name}: expected all nine parts, got {sorted(parts)}"
+    parts = set(np.unique(one.mask.values)) - {-1}  # -1 is no part
+    assert parts == set(range(9)), f"{name}: expected all nine parts, got {sorted(parts)}"
+
+# %%
 for name, choices in drawn_from.items():
     if len(choices[0]) == 2:  # mean and SD; draws are cut at MAX_SD, and the two sides differ by a few percent
-        low = min(mean - phantom.MAX_SD * sd for mean, sd in choices) * 0.95
-        high = max(mean + phantom.MAX_SD * sd for mean, sd in choices) * 1.05
+        low = min(mean - phantom.sizes.MAX_SD * sd for mean, sd in choices) * 0.95
+        high = max(mean + phantom.sizes.MAX_SD * sd for mean, sd in choices) * 1.05
         assert table.loc[name].between(low, high).all(), (
             f"{name}: expected {low:.0f}-{high:.0f} mm, got {table.loc[name]}"
         )
+
+# %%
 # The paper's own pairs start from several millimetres; people closer than 3 mm would make every method look good.
 assert apart["phantom"].between(3.0, 12.0).all(), f"expected people 3-12 mm apart, got {apart['phantom']}"
 if source is not None:
-    stated = pd.Series(
-        {f"{cohorts.PLANTED_SOURCE[1]} to {name}": size for name, size in cohorts.PLANTED_SIZES_MM.items()}
-    )
+    stated = pd.Series({f"{origin} to {name}": size for name, size in datasets.planted.SIZES_MM.items()})
     assert np.allclose(apart["planted"], stated, rtol=0.1), f"expected the stated sizes, got {apart['planted']}"

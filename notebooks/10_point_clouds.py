@@ -20,24 +20,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from study import cohorts, figures
-from study.anatomy import measure_anatomy
-from study.cartilage_growth import parts_from_ribs
-from study.ct import on_grid, points_for_spacing, surface
-from study.data.fetch import fetch
-from study.data.landmarks import read_landmarks
-from study.data.manifest import load_manifest
-from study.data.volumes import read_labels
-from study.errors import StudyError
-from study.geometry import sample_spacing_mm
-from study.params import check_parameters, find_profile
-from study.sweep import surface_distance_mm
-from study.types import Part
+from study import ct, datasets, figures, geometry, params
 
-check_parameters(globals(), dataset=str, profile=str, seed=int)
-params = find_profile(profile)
+params.check_parameters(globals(), dataset=str, profile=str, seed=int)
+data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
 pd.options.display.max_colwidth = None
-manifest = load_manifest()
 
 # %% [markdown]
 # ## Who was cut how
@@ -46,34 +33,19 @@ manifest = load_manifest()
 # and the sternum's midline; the cartilage grows between them by density and shape.
 
 # %%
-entries = dict(manifest.cohort("open" if dataset == "planted" else dataset).subjects)
-if dataset == "planted":
-    entries = {cohorts.PLANTED_SOURCE[1]: entries[cohorts.PLANTED_SOURCE[1]]}  # the others are this one, deformed
+names = data.with_ct()  # the others are one of these, deformed
 if profile == "quick":
-    entries = dict(list(entries.items())[:2])
-how, by, unsure = {}, {}, {}
-for name, entry in entries.items():
-    path = manifest.landmarks_path(entry)
-    if entry.labels or entry.ct is None:
-        how[name] = "labels" if entry.ct else "labels, exact"
-        by[name] = manifest.file(entry.labels.file).oddities[0] if entry.labels else "made with the image"
-    elif entry.rib_labels:
-        how[name], by[name] = "rib labels", manifest.file(entry.rib_labels.file).title
-    elif path is not None and path.is_file():
-        landmarks = read_landmarks(path)
-        how[name], by[name], unsure[name] = "landmarks", landmarks.made_by, "; ".join(landmarks.hard_to_see)
-    else:
-        how[name], by[name] = "not yet", f"waits for {entry.landmarks}"
-pd.DataFrame({"cut by": how, "made by": by, "hard to see": unsure}).fillna("").reindex(list(entries))
+    names = names[:2]
+cuts = {name: data.cut(name) for name in names}
+pd.DataFrame(
+    {"cut by": cut.by, "made by": cut.made_by, "hard to see": cut.hard_to_see} for cut in cuts.values()
+).set_index(pd.Index(names))
 
 # %%
-people = {}
-for name in entries:
-    try:
-        people[name] = cohorts.load_anatomy(dataset, name, params, seed)
-    except StudyError as error:
-        print(f"{name} is left out: {error}")
-print(f"{len(people)} of {len(entries)} subjects: {', '.join(people)}")
+people, left_out = data.anatomies(names)
+for name, reason in left_out.items():
+    print(f"{name} is left out: {reason}")
+print(f"{len(people)} of {len(names)} subjects: {', '.join(people)}")
 
 # %% [markdown]
 # ## Slice, surface, cloud
@@ -83,17 +55,17 @@ print(f"{len(people)} of {len(entries)} subjects: {', '.join(people)}")
 # nothing.
 
 # %%
-one_of_each = {how[name]: name for name in reversed(people)}  # the first of each kind
-names = dict.fromkeys([*reversed(one_of_each.values()), *people])
-examples = [people[name] for name in list(names)[:2]]
+one_of_each = {cuts[name].by: name for name in reversed(people)}  # the first of each kind
+shown = dict.fromkeys([*reversed(one_of_each.values()), *people])
+examples = [people[name] for name in list(shown)[:2]]
 
 
 def slices(one):
     """A subject's parts on its CT, under the subject's name."""
-    return figures.ct_slice(replace(one.image, name=one.name), on_grid(one.mask, one.image))
+    return figures.ct_slice(replace(one.image, name=one.name), ct.on_grid(one.mask, one.image))
 
 
-print(" and ".join(f"{one.name}, cut by {how[one.name]}" for one in examples))
+print(" and ".join(f"{one.name}, cut by {cuts[one.name].by}" for one in examples))
 slices(examples[0])
 
 # %%
@@ -115,17 +87,18 @@ figures.mesh_and_cloud(examples[-1].mesh, examples[-1].cloud)
 # surface it was drawn from. The last column says how many points the density of the ultrasound cloud would take.
 
 # %%
+spacing_mm = data.params.us_spacing_mm
 clouds = pd.DataFrame(
     {
         name: {
             "points": len(one.cloud),
             "triangles": len(one.mesh.faces),
-            "spacing (mm)": sample_spacing_mm(one.cloud.points),
-            "to the surface, at most (mm)": surface_distance_mm(one.cloud.points, one.mesh).max(),
-            "fewest points on a part": min(len(one.cloud.only(part)) for part in Part if part != Part.UNKNOWN),
+            "spacing (mm)": geometry.sample_spacing_mm(one.cloud.points),
+            "to the surface, at most (mm)": geometry.surface_distance_mm(one.cloud.points, one.mesh).max(),
+            "fewest points on a part": min((one.cloud.parts == part).sum() for part in range(9)),
             "width (mm)": np.ptp(one.mesh.vertices[:, 0]),
             "height (mm)": np.ptp(one.mesh.vertices[:, 2]),
-            f"points for {params.us_spacing_mm:g} mm": points_for_spacing(one.mesh, params.us_spacing_mm),
+            f"points for {spacing_mm:g} mm": ct.points_for_spacing(one.mesh, spacing_mm),
         }
         for name, one in people.items()
     }
@@ -141,40 +114,32 @@ clouds.round(2).astype(dict.fromkeys(counts, int))
 # algorithms, so agreement is not proof; where they disagree the density in the slice tells who is right.
 
 # %%
-judged = next((n for n, e in entries.items() if e.labels and e.ct and profile == "full" and dataset == "open"), None)
-agreement = None
+judged, agreement, worst = None, None, None
+for name, one in people.items() if profile == "full" else ():
+    grown = data.grown(name, one.image)
+    if grown is not None:
+        found, judged = ct.compare_parts(grown, one.mask, one.image), one
+        break
 if judged is None:
-    print("only with dataset=open and profile=full")
+    print("only where cartilage is labelled and profile=full")
 else:
-    labelled, labels = people[judged], entries[judged].labels
-    ids = manifest.label_ids(labels.map)
-    grown = parts_from_ribs(labelled.image, read_labels(fetch(manifest.file(labels.file)), labelled.image), ids)
-    grown_mesh = surface(grown)
-
-    ours, theirs = (on_grid(mask, labelled.image) for mask in (grown, labelled.mask))
-    one, other = (volume.values != Part.UNKNOWN for volume in (ours, theirs))
-    places = np.concatenate([grown_mesh.vertices, labelled.mesh.vertices])
-    far = np.concatenate(
-        [
-            surface_distance_mm(grown_mesh.vertices, labelled.mesh),
-            surface_distance_mm(labelled.mesh.vertices, grown_mesh),
-        ]
-    )
     agreement = pd.Series(
         {
-            "Dice, all parts": 2 * (one & other).sum() / (one.sum() + other.sum()),
-            "surfaces apart, mean (mm)": far.mean(),
-            "95 % below (mm)": np.percentile(far, 95),
-            "worst (mm)": far.max(),
+            "Dice, all parts": found.dice,
+            "surfaces apart, mean (mm)": found.distances_mm.mean(),
+            "95 % below (mm)": np.percentile(found.distances_mm, 95),
+            "worst (mm)": found.distances_mm.max(),
         },
-        name=judged,
+        name=judged.name,
     )
 agreement.round(2).to_frame() if agreement is not None else None
 
 # %%
-figures.ct_slice(
-    replace(labelled.image, name=judged), ours, reference=theirs, at_mm=places[far.argmax()]
-) if judged else None
+if judged is not None:
+    ours, theirs = (ct.on_grid(mask, judged.image) for mask in (grown, judged.mask))
+    image = replace(judged.image, name=judged.name)
+    worst = figures.ct_slice(image, ours, reference=theirs, at_mm=found.worst_place)
+worst
 
 # %% [markdown]
 # ## How large the cartilages are
@@ -183,7 +148,7 @@ figures.ct_slice(
 # faults: on slices of 5 mm a width is not known to better than a few millimetres.
 
 # %%
-measured = [measure_anatomy(one.image, one.mask, name) for name, one in people.items() if one.image is not None]
+measured = [ct.measure_anatomy(one.image, one.mask, name) for name, one in people.items() if one.image is not None]
 long = pd.concat(measured)
 long["part"] = long["part"].str.replace(r"^(right|left)_", "rib ", regex=True)  # the mean of both sides
 kept = long[long["quantity"].isin(["length", "width", "thickness"]) | (long["part"] == "cartilages")]
@@ -204,8 +169,10 @@ anatomy[list(people)].round(2)
 
 # %%
 assert people, "expected at least one subject"
-assert len(people) == sum(kind != "not yet" for kind in how.values()), "a subject with labels or landmarks was left out"
-assert (clouds["points"] == params.ct_points).all(), f"expected {params.ct_points} points each, got {clouds['points']}"
+assert len(people) == sum(cut.is_done for cut in cuts.values()), "a subject with labels or landmarks was left out"
+assert (clouds["points"] == data.params.ct_points).all(), (
+    f"expected {data.params.ct_points} points each, got {clouds['points']}"
+)
 # Open3D samples the triangles themselves; what is left is single precision.
 assert (clouds["to the surface, at most (mm)"] < 0.05).all(), "points must lie on the surface"
 assert (clouds["fewest points on a part"] >= 20).all(), "a part with fewer points cannot be cut into its waypoints"

@@ -16,35 +16,14 @@ profile = "full"  # full or quick
 seed = 0
 
 # %%
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 
-from study import METHODS, figures
-from study.coarse import Alignment, find_chest
-from study.cohorts import FRONT, load_anatomy, make_patient, pairs
-from study.errors import StudyError
-from study.metrics import directed_distances_mm, waypoint_errors_mm
-from study.params import check_parameters, find_profile
-from study.pipeline import find_method, named_rng, register_aligned
-from study.sweep import (
-    Probe,
-    SweepErrors,
-    error_budget,
-    error_table,
-    simulate_calibration_views,
-    simulate_latency_run,
-    simulate_sweep,
-    surface_distance_mm,
-    true_parts,
-    visible_mesh,
-)
-from study.us import calibrate_latency, calibrate_spatial, contour_points, sweep_cloud
+from study import datasets, evaluation, figures, params, seeds, ultrasound
 
-check_parameters(globals(), dataset=str, profile=str, seed=int)
-params = find_profile(profile)
-probe = Probe()
+params.check_parameters(globals(), dataset=str, profile=str, seed=int)
+data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
+probe = ultrasound.Probe()
 pd.options.display.max_colwidth = None
 
 # %% [markdown]
@@ -54,9 +33,8 @@ pd.options.display.max_colwidth = None
 # back. The motion is simulated, with one pixel of noise on the landmark and frames that are not quite evenly spaced.
 
 # %%
-LATENCY_PAPER_S = SweepErrors.only("latency").latency_uncorrected_s
-run = simulate_latency_run(LATENCY_PAPER_S, named_rng(seed, "us/latency"), probe=probe)
-latency = calibrate_latency(*run)
+run = ultrasound.simulate_latency_run(ultrasound.LATENCY_S, seeds.named_rng(seed, "us/latency"), probe=probe)
+latency = ultrasound.calibrate_latency(*run)
 figures.latency_fit(*run, latency.latency_s)
 
 # %% [markdown]
@@ -64,8 +42,9 @@ figures.latency_fit(*run, latency.latency_s)
 
 # %%
 recovered = []
-for planted_s in (0.0, 0.1, 0.2, LATENCY_PAPER_S, 0.3, 0.4, 0.5):
-    found = calibrate_latency(*simulate_latency_run(planted_s, named_rng(seed, f"us/latency/{planted_s}"), probe=probe))
+for planted_s in (0.0, 0.1, 0.2, ultrasound.LATENCY_S, 0.3, 0.4, 0.5):
+    rng = seeds.named_rng(seed, f"us/latency/{planted_s}")
+    found = ultrasound.calibrate_latency(*ultrasound.simulate_latency_run(planted_s, rng, probe=probe))
     recovered.append(
         {
             "planted (ms)": 1000 * planted_s,
@@ -87,7 +66,8 @@ recovered.set_index("planted (ms)")
 # real calibration could report; how far the answer is off can only be known here.
 
 # %%
-spatial = calibrate_spatial(*simulate_calibration_views(named_rng(seed, "us/spatial"), probe=probe))
+views = ultrasound.simulate_calibration_views(seeds.named_rng(seed, "us/spatial"), probe=probe)
+spatial = ultrasound.calibrate_spatial(*views)
 off = spatial.T_probe_image @ probe.T_probe_image.inverse
 shift_mm = float(np.linalg.norm(spatial.T_probe_image.translation - probe.T_probe_image.translation))
 pd.DataFrame(
@@ -108,19 +88,18 @@ pd.DataFrame(
 # surface. There is no B-mode picture behind it; speckle is not simulated, because only the line goes on.
 
 # %%
-source, target = pairs(dataset, params)[0]
-anatomy = load_anatomy(dataset, source, params, seed)
-patient = make_patient(load_anatomy(dataset, target, params, seed), params, seed)
+source, target = data.pairs()[0]
+anatomy, patient = data.anatomy(source), data.patient(target)
 surface = patient.anatomy.mesh
 
 
 def sweep_with(errors, repeat=None):
     """The patient's sweep under some errors; every case of one repeat shares its random draws."""
-    name = f"{target}/sweep" if repeat is None else f"{target}/sweep/{repeat}"
-    return simulate_sweep(surface, FRONT, errors, named_rng(seed, name), T_base_patient=patient.T_us_ras, name=target)
+    rng = seeds.named_rng(seed, f"{target}/sweep" if repeat is None else f"{target}/sweep/{repeat}")
+    return ultrasound.simulate_sweep(surface, datasets.FRONT, errors, rng, T_base_patient=patient.T_us_ras, name=target)
 
 
-sweep = sweep_with(SweepErrors())
+sweep = sweep_with(ultrasound.SweepErrors())
 fullest = int(sweep.masks.any(axis=1).sum(axis=1).argmax())
 figures.frame_with_mask(
     sweep.masks[fullest], sweep.pixel_spacing_mm, title=f"mask of frame {fullest} of {sweep.n_frames} (simulated)"
@@ -168,26 +147,21 @@ pd.Series(
 # latency moves them apart, along the body; the colour shows it least where the surface itself runs that way.
 
 # %%
-visible = visible_mesh(surface, FRONT)
-
-
-def in_ras(sweep):
-    """The cloud of a sweep in the frame of the true surface."""
-    return patient.T_us_ras.inverse.apply(sweep_cloud(sweep, spacing_mm=params.us_spacing_mm).cloud.points)
-
-
-cases = dict(error_budget())
+visible = ultrasound.visible_mesh(surface, datasets.FRONT)
+scanned = evaluation.Scanned(surface, visible, patient.T_us_ras, patient.anatomy.waypoints.points)
+cases = dict(ultrasound.budget_cases())
 shown = {"no errors": "none", "all": "all", "all, latency left in": "all, latency not corrected"}
-clouds = {title: in_ras(sweep_with(cases[name])) for title, name in shown.items()}
-figures.cloud_errors(
-    {title: (points, surface_distance_mm(points, visible)) for title, points in clouds.items()}, visible
-)
+clouds = {}
+for title, name in shown.items():
+    seen = ultrasound.sweep_cloud(sweep_with(cases[name]), spacing_mm=data.params.us_spacing_mm)
+    clouds[title] = scanned.in_ras(seen.cloud.points)
+figures.cloud_errors({title: (points, scanned.distances_mm(points)) for title, points in clouds.items()}, visible)
 
 # %% [markdown]
 # ## The errors, and where their sizes come from
 
 # %%
-pd.DataFrame(error_table()).set_index(["source", "field"])
+pd.DataFrame(ultrasound.error_table()).set_index(["source", "field"])
 
 # %% [markdown]
 # ## What each error costs
@@ -201,40 +175,16 @@ pd.DataFrame(error_table()).set_index(["source", "field"])
 
 # %%
 REPEATS = {"full": 2, "quick": 1}
-judged = [name for name in METHODS if name != "coarse"]
-chest = find_chest(anatomy.cloud)
-goal = patient.T_us_ras.apply(patient.anatomy.waypoints.points)
-long, refused = [], []
-for repeat in range(REPEATS[profile]):
-    undisturbed, frames, *_ = contour_points(sweep_with(SweepErrors.none(), repeat))
-    for name, errors in cases.items():
-        sweep = sweep_with(errors, repeat)
-        found = sweep_cloud(sweep, spacing_mm=params.us_spacing_mm)
-        points = patient.T_us_ras.inverse.apply(found.cloud.points)
-        near = directed_distances_mm(visible.vertices, points) < 1.25 * params.us_spacing_mm
-        values = {"surface_distance": surface_distance_mm(points, visible).mean(), "covered": 100 * near.mean()}
-        contour, its_frames, *_ = contour_points(sweep)
-        if np.array_equal(its_frames, frames):  # the same pixels: only then do points pair
-            values["moved"] = np.linalg.norm(contour - undisturbed, axis=1).mean()
-        long += [{"source": name, "repeat": repeat, "metric": m, "method": "", "value": v} for m, v in values.items()]
-        cloud = replace(found.cloud, front=found.front)
-        try:
-            start = find_chest(cloud)
-            if name == "none":
-                undisturbed_start = start
-        except StudyError as error:
-            refused.append({"source": name, "sweep": repeat, "reason": str(error)})
-            start = replace(undisturbed_start, cloud=replace(cloud, parts=true_parts(points, surface)))
-        alignment = Alignment(chest, start)
-        normal = alignment.target.T_cloud_chest.rotation[:, 2]
-        for method in judged:
-            result = register_aligned(alignment, find_method(method), named_rng(seed, f"us/{repeat}/{method}"))
-            carried = result.transfer(anatomy.waypoints.points, params.radius_mm)
-            for metric, plane in (("waypoint_error", None), ("waypoint_error_inplane", normal)):
-                error = waypoint_errors_mm(carried, goal, plane).mean()
-                long.append({"source": name, "repeat": repeat, "metric": metric, "method": method, "value": error})
-budget = pd.DataFrame(long)
-in_plane = budget[budget["metric"] != "waypoint_error"].replace(
+budget = evaluation.error_budget(
+    data.pair(anatomy, patient),
+    scanned,
+    sweep_with,
+    seed=seed,
+    repeats=REPEATS[profile],
+    spacing_mm=data.params.us_spacing_mm,
+    radius_mm=data.params.radius_mm,
+)
+in_plane = budget.rows[budget.rows["metric"] != "waypoint_error"].replace(
     {"metric": {"waypoint_error_inplane": "waypoint_error"}}
 )
 figures.error_budget(in_plane, note=f"{figures.SIMULATED}; waypoints in the feature plane")
@@ -246,12 +196,9 @@ figures.error_budget(in_plane, note=f"{figures.SIMULATED}; waypoints in the feat
 # it; `by hand` counts the sweeps whose coarse alignment was refused.
 
 # %%
-means = budget.pivot_table(index="source", columns=["metric", "method"], values="value", sort=False)
 columns = {"cloud to surface (mm)": "surface_distance", "points moved (mm)": "moved", "covered (%)": "covered"}
-table = pd.DataFrame({title: means[metric, ""] for title, metric in columns.items()})
-failed = pd.DataFrame(refused, columns=["source", "sweep", "reason"])
-table.insert(0, "by hand", failed.groupby("source").size().reindex(table.index, fill_value=0))
-table = table.loc[list(cases)]
+table = pd.DataFrame({title: budget.mean(metric)[""] for title, metric in columns.items()})
+table.insert(0, "by hand", budget.by_hand())
 print(f"{REPEATS[profile]} sweeps of each case")
 table.style.format("{:.2f}", na_rep="", subset=list(columns)).format("{:.0f}", na_rep="", subset=["covered (%)"])
 
@@ -263,9 +210,9 @@ table.style.format("{:.2f}", na_rep="", subset=list(columns)).format("{:.0f}", n
 # there is no such thing.
 
 # %%
-labels = {method: figures.method_style(method).label for method in judged}
+labels = {method: figures.method_style(method).label for method in budget.methods}
 costs = {
-    kind: means[metric].loc[list(cases), judged].rename(columns=labels)
+    kind: budget.mean(metric).rename(columns=labels)
     for kind, metric in (("in the plane", "waypoint_error_inplane"), ("in space", "waypoint_error"))
 }
 costs["in the plane"].rename_axis("in the feature plane (mm)").style.format("{:.2f}")
@@ -274,8 +221,8 @@ costs["in the plane"].rename_axis("in the feature plane (mm)").style.format("{:.
 costs["in space"].rename_axis("in space (mm)").style.format("{:.2f}")
 
 # %%
-print(f"the coarse alignment refused {len(failed)} of {REPEATS[profile] * len(cases)} sweeps")
-failed.groupby("source", sort=False).agg(sweeps=("sweep", "size"), reason=("reason", "first"))
+print(f"the coarse alignment refused {len(budget.refused)} of {REPEATS[profile] * len(cases)} sweeps")
+budget.refused.groupby("source", sort=False).agg(sweeps=("sweep", "size"), reason=("reason", "first"))
 
 # %% [markdown]
 # ## What this shows
@@ -291,14 +238,14 @@ assert off.angle_deg < 0.3, f"expected the image within 0.3° of its place, got 
 distance = table["cloud to surface (mm)"]
 assert distance["none"] < 0.2, f"a sweep without errors must lie within a pixel of the surface, got {distance['none']}"
 assert distance["all"] < 1.5, f"all errors together must stay below half a cartilage, got {distance['all']} mm"
-assert distance["latency"] == distance[list(cases)[1:-2]].max(), "a latency left in must be the worst single error"
-lag_mm = probe.speed_mm_s * LATENCY_PAPER_S
+assert distance["latency"] == distance[budget.sources[1:-2]].max(), "a latency left in must be the worst single error"
+lag_mm = probe.speed_mm_s * ultrasound.LATENCY_S
 moved_mm = table["points moved (mm)"]["latency"]
 # The hand strays a little and stops at each turn, so its mean speed is not quite the nominal one.
 assert abs(moved_mm - lag_mm) < 0.1 * lag_mm, (
     f"expected a shift of speed times lag, {lag_mm:.2f} mm, got {moved_mm:.2f}"
 )
-usual = ~failed["source"].isin(["latency", "all, latency not corrected"])
-assert not usual.any(), f"the coarse alignment must take a sweep with ordinary errors:\n{failed[usual]}"
+usual = budget.refused[~budget.refused["source"].isin(["latency", "all, latency not corrected"])]
+assert usual.empty, f"the coarse alignment must take a sweep with ordinary errors:\n{usual}"
 graph = costs["in the plane"][labels["skeleton_graph"]]
 assert graph["all, latency not corrected"] > graph["all"], "a latency left in must cost the waypoints something"

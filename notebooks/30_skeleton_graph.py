@@ -17,26 +17,15 @@ profile = "full"  # full or quick
 seed = 0
 
 # %%
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 from IPython.display import Markdown, display
 
-from study import METHODS, figures
-from study.coarse import align, chest_frame
-from study.cohorts import load_anatomy, make_patient, pairs, truth_map
-from study.methods.visible_surface import VisibleSurface
-from study.metrics import population_sd, waypoint_errors_mm
-from study.params import check_parameters, find_profile
-from study.pipeline import named_rng, register_aligned
-from study.som import quantisation_error_mm
-from study.template import template_graph
+from study import datasets, evaluation, figures, params, pipeline
 from study.types import Part
-from study.waypoints import intercostal_waypoints
 
-check_parameters(globals(), dataset=str, profile=str, seed=int)
-params = find_profile(profile)
+params.check_parameters(globals(), dataset=str, profile=str, seed=int)
+data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
 MOST_PAIRS = 5  # for the choices below: as many as the paper has CTs
 
 # %% [markdown]
@@ -45,18 +34,14 @@ MOST_PAIRS = 5  # for the choices below: as many as the paper has CTs
 # the ultrasound, seen along the chest axes that the coarse alignment found.
 
 # %%
-target = pairs(dataset, params)[0][1]
-patient = make_patient(load_anatomy(dataset, target, params, seed), params, seed)
-sources = [source for source, of in pairs(dataset, params) if of == target]
-todo = [(source, target) for source in sources][:MOST_PAIRS]
-if len(todo) < 2:  # planted: one CT, several patients
-    todo = pairs(dataset, params)[:MOST_PAIRS]
-anatomies = {source: load_anatomy(dataset, source, params, seed) for source in dict.fromkeys(s for s, _ in todo)}
-patients = {
-    name: patient if name == target else make_patient(load_anatomy(dataset, name, params, seed), params, seed)
-    for name in dict.fromkeys(t for _, t in todo)
-}
-alignments = {(s, t): align(anatomies[s].cloud, patients[t].cloud) for s, t in todo}
+first_patient = data.pairs()[0][1]
+todo = [(source, target) for source, target in data.pairs() if target == first_patient][:MOST_PAIRS]
+if len(todo) < 2:  # one CT, several patients
+    todo = data.pairs()[:MOST_PAIRS]
+sources, targets = (list(dict.fromkeys(names)) for names in zip(*todo, strict=True))
+anatomies = {name: data.anatomy(name) for name in sources}
+patients = {name: data.patient(name) for name in targets}
+pairs = [data.pair(anatomies[source], patients[target]) for source, target in todo]
 pd.DataFrame(
     [
         {"CT": s, "patient": t, "CT points": len(anatomies[s].cloud), "US points": len(patients[t].cloud)}
@@ -74,16 +59,14 @@ pd.DataFrame(
 # not have. Bottom right: after it has learnt the ultrasound cloud, starting from the CT graph.
 
 # %%
-first = todo[0]
-method = METHODS["skeleton_graph"]
-alignment = alignments[first]
-ct_aligned = alignment.source.cloud.moved(alignment.T_us_ct)
-template = template_graph(chest_frame(ct_aligned))
-result = register_aligned(alignment, method, named_rng(seed, "/".join(first)))
-g_ct, g_us = result.extras["g_ct"], result.extras["g_us"]
-T_us_chest = alignment.target.T_cloud_chest
-us = patients[first[1]].cloud
-figures.graph_triptych(template, g_ct, g_us, ct_aligned.points, us.points, T_cloud_chest=T_us_chest)
+first = pairs[0]
+method = pipeline.find_method("skeleton_graph")
+result = pipeline.register_aligned(first.alignment, method, data.rng(first.name))
+template, g_ct, g_us = result.template, result.g_ct, result.g_us
+T_us_chest = first.alignment.target.T_cloud_chest
+ct_aligned = first.alignment.T_us_ct.apply(first.alignment.source.cloud.points)
+us = first.alignment.target.cloud.points
+figures.graph_triptych(template, g_ct, g_us, ct_aligned, us, T_cloud_chest=T_us_chest)
 
 # %% [markdown]
 # The count the paper gives and the one its grid has differ by one node; the template here is the grid of the authors'
@@ -91,9 +74,9 @@ figures.graph_triptych(template, g_ct, g_us, ct_aligned.points, us.points, T_clo
 
 # %%
 single = figures.one_way(template.edges)
-levels = [part.level for part in map(Part, template.parts)]
-counts = pd.Series(levels).replace({0: "sternum"}).astype(str).value_counts(sort=False)
-from_level = pd.Series([str(levels[tail] or "sternum") for tail in template.edges[single][:, 0]]).value_counts()
+levels = np.array([str(Part(part).level or "sternum") for part in template.parts])
+counts = pd.Series(levels).value_counts(sort=False)
+from_level = pd.Series(levels[template.edges[single, 0]]).value_counts()
 pd.DataFrame({"nodes": counts, "one-way edges": from_level.reindex(counts.index, fill_value=0)}).rename_axis(
     "sternum, or level of the cartilage"
 ).T.assign(total=[len(template), int(single.sum())])
@@ -125,7 +108,7 @@ figures.som_progress({"CT map": halves[0], "US map": halves[1]})
 
 # %%
 move = T_us_chest.rotation.T @ (g_us.nodes - g_ct.nodes).T  # left, up, front
-names = np.array(["sternum" if level == 0 else f"cartilages {level}" for level in levels])
+names = ["sternum" if level == "sternum" else f"cartilages {level}" for level in levels]
 moves = pd.DataFrame(
     {
         "part": names,
@@ -151,126 +134,13 @@ moves.round(1)
 # with other random draws, since the map keeps moving with every point it draws. Its mean ± SD is shaded over all rows;
 # only a change that leaves the shade is more than luck. Cases beyond the axis are an arrow with the farthest value.
 
-
 # %%
-def maps(ct=None, us=None, **changes):
-    """The published method with other schedules of its maps."""
-    return replace(
-        method,
-        ct_som=replace(method.ct_som, **{**changes, **(ct or {})}),
-        us_som=replace(method.us_som, **{**changes, **(us or {})}),
-    )
-
-
-AUTHORS_EPOCHS = {"ct": {"epochs": 5000, "samples": 500}, "us": {"epochs": 3000, "samples": 130}}
-RIGID = "all nodes: rigid"
-AS_AUTHORS = "authors' schedule, rate and N_reg"
-MORE_DRAWS = ("second", "third", "fourth")
-radius_mm = params.radius_mm
-# choice, published option, [(other option, role, method, sphere)]
-CHOICES = [
-    ("random draws", "one seed", [("other seeds", "yardstick", method, radius_mm)]),
-    (
-        "learning rate (Eq. 2)",
-        som.rate_schedule,
-        [
-            ("compounding", "authors", maps(rate_schedule="compounding"), radius_mm),
-            ("linear to 0", "alternative", maps(rate_schedule="linear"), radius_mm),
-        ],
-    ),
-    (
-        "epochs × samples (paper silent)",
-        f"{som.epochs} × {som.samples}",
-        [
-            ("5000 × 500, US 3000 × 130", "authors", maps(**AUTHORS_EPOCHS), radius_mm),
-            (f"{som.epochs // 5} × {som.samples}", "alternative", maps(epochs=som.epochs // 5), radius_mm),
-        ],
-    ),
-    (
-        "start of the neighbourhood (paper silent)",
-        f"{som.radius:g} hops",
-        [
-            ("2 hops", "alternative", maps(radius=2.0), radius_mm),
-            ("3 hops", "alternative", maps(radius=3.0), radius_mm),
-        ],
-    ),
-    (
-        "one-way edges in the first epochs",
-        f"{som.pretrain_epochs} epochs",
-        [("none", "alternative", maps(pretrain_epochs=0), radius_mm)],
-    ),
-    (
-        "nodes that may win a point",
-        som.winners,
-        [("of the point's own part", "alternative", maps(winners="own_part"), radius_mm)],
-    ),
-    (
-        "nodes of a local transform (Eq. 3)",
-        f"{method.n_reg} {method.neighbours}",
-        [
-            ("within 3 hops", "authors", replace(method, n_reg=3, neighbours="hops"), radius_mm),
-            ("16 nodes", "alternative", replace(method, n_reg=16), radius_mm),
-            (RIGID, "alternative", replace(method, n_reg=len(template)), radius_mm),
-        ],
-    ),
-    (
-        "weights of the blend (Eq. 4)",
-        method.blend_weights,
-        [("inverse distance", "alternative", replace(method, blend_weights="inverse_distance"), radius_mm)],
-    ),
-    (
-        "N of the blend (paper silent)",
-        f"{method.blend_k} nodes",
-        [
-            ("1 node", "alternative", replace(method, blend_k=1), radius_mm),
-            ("8 nodes", "alternative", replace(method, blend_k=8), radius_mm),
-        ],
-    ),
-    (
-        "sphere of path transfer (§III-D)",
-        f"{radius_mm:g} mm",
-        [("30 mm", "alternative", method, 30.0), ("40 mm", "alternative", method, 40.0)],
-    ),
-]
-visible = [("what a probe can see", "alternative", VisibleSurface(method), radius_mm)]
-CHOICES.append(("surface of the CT that is registered", "all of it", visible))
-everything = replace(maps(**AUTHORS_EPOCHS, rate_schedule="compounding"), n_reg=3, neighbours="hops")
-together = [(AS_AUTHORS, "authors", everything, radius_mm)]
-together += [(name, "alternative", METHODS[name], radius_mm) for name in METHODS if name.startswith("skeleton_graph_")]
-CHOICES.append(("all of it together", "as published", together))
-
-# %%
-runs = {}
-goals = {}
-for source, of in todo:
-    there = patients[of]
-    truth = truth_map(dataset, anatomies[source], of)
-    normal = alignments[source, of].target.T_cloud_chest.rotation[:, 2]
-    goals[source, of] = [("protocol", intercostal_waypoints(there.labelled).points, None)]
-    if truth is not None:
-        true_place = there.T_us_ras.apply(truth(anatomies[source].waypoints.points))
-        goals[source, of].append(("truth, in the feature plane", true_place, normal))
-
-
-def errors(pair, chosen, sphere, draw):
-    """Mean waypoint errors of one pair under one option; the maps run once for every sphere."""
-    key = (pair, chosen, draw)
-    if key not in runs:
-        runs[key] = register_aligned(alignments[pair], chosen, named_rng(seed, f"{'/'.join(pair)}/{draw}"))
-    moved = runs[key].transfer(anatomies[pair[0]].waypoints.points, sphere)
-    return {judge: waypoint_errors_mm(moved, goal, normal).mean() for judge, goal, normal in goals[pair]}
-
-
-rows = []
-for choice, published, options in CHOICES:
-    for option, role, chosen, sphere in [(published, "paper", method, radius_mm), *options]:
-        what = {"choice": choice, "option": option, "role": role}
-        for pair in todo:
-            for draw in MORE_DRAWS if role == "yardstick" else ("first",):
-                found = errors(pair, chosen, sphere, draw)
-                rows += [{**what, "case": " to ".join(pair), "judge": j, "value": value} for j, value in found.items()]
-table = pd.DataFrame(rows)
-figures.sensitivity(table[table["judge"] == "protocol"], note="protocol; simulated patient")
+options = evaluation.options(method, data.params.radius_mm)
+changed = evaluation.changes(evaluation.ablate(pairs, options, seed))
+by_protocol, by_truth = (
+    changed[changed["judge"] == judge] for judge in (evaluation.PROTOCOL, evaluation.TRUE_IN_PLANE)
+)
+figures.sensitivity(by_protocol, note="protocol; simulated patient")
 
 # %% [markdown]
 # The same, judged by the truth where it is known: the waypoints carried by the known deformation, in the feature plane.
@@ -278,26 +148,25 @@ figures.sensitivity(table[table["judge"] == "protocol"], note="protocol; simulat
 # believe this one.
 
 # %%
-true_table = table[table["judge"] != "protocol"]
-if true_table.empty:
-    view = f"{dataset}: two real people, the true correspondence is not known"
+if by_truth.empty:
+    view = f"{data.name}: two real people, the true correspondence is not known"
 else:
-    view = figures.sensitivity(true_table, note="truth, in plane; simulated patient")
+    view = figures.sensitivity(by_truth, note="truth, in plane; simulated patient")
 view
 
 # %% [markdown]
 # In numbers: the mean waypoint error of each option, its change against the published one on the same pairs, and n.
 
 # %%
-base = table[table["role"] == "paper"].set_index(["choice", "judge", "case"])["value"]
-others = table.join(base.rename("published"), on=["choice", "judge", "case"])
-others = others.assign(change=others["value"] - others["published"])
-summary = others.groupby(["choice", "option", "role", "judge"], sort=False).agg(
+summary = changed.groupby(["choice", "option", "role", "judge"], sort=False).agg(
     error=("value", "mean"), change=("change", "mean"), n=("case", "nunique")
 )
 wide = summary.unstack("judge").round(2)
 wide.columns = [f"{judge}: {what}{'' if what == 'n' else ' (mm)'}" for what, judge in wide.columns]
 wide.reindex(summary.index.droplevel("judge").unique())
+
+# %% [markdown]
+# What a reader takes along comes from the truth where it is known, from the protocol where it is not.
 
 
 # %%
@@ -306,50 +175,51 @@ def signed(value):
     return f"{round(value, 2) + 0.0:+.2f}".replace("-", "−")
 
 
-covered = {
-    "CT": quantisation_error_mm(g_ct.nodes, ct_aligned.points),
-    "US": quantisation_error_mm(g_us.nodes, us.points),
-}
-judge = "protocol" if true_table.empty else true_table["judge"].iloc[0]
-judged = others[(others["judge"] == judge) & (others["role"] != "paper")]
-draws = judged.loc[judged["role"] == "yardstick", "change"]
-low, high = draws.mean() - population_sd(draws), draws.mean() + population_sd(draws)
-change = judged[judged["role"] != "yardstick"].groupby(["choice", "option"], sort=False)["change"].mean()
-beyond = change[(change < low) | (change > high)]
-all_of_it = change.xs(AS_AUTHORS, level="option").iloc[0]
+judged = by_protocol if by_truth.empty else by_truth
+(low, high), beyond = evaluation.beyond_luck(judged)
 listed = "; ".join(f"{choice}, {option}: {signed(value)} mm" for (choice, option), value in beyond.items())
+change = judged.groupby("option")["change"].mean()
+n_others = sum(option.role in ("authors", "alternative") for option in options)
+rigid, all_of_it = change[evaluation.RIGID], change[evaluation.AS_AUTHORS]
+covered = {"CT": halves[0][-1], "US": halves[1][-1]}  # the quantisation errors when the schedules ended
+
+# %%
 display(
     Markdown(
         "## What this shows\n"
         f"- On this pair the graph keeps its numbering through both maps. A point lies {covered['CT']:.1f} mm from its "
         f"nearest node on the CT cloud and {covered['US']:.1f} mm on the ultrasound cloud, on average.\n"
-        f"- Other random draws change the mean waypoint error ({judge}; n = {judged['case'].nunique()} pairs) by "
-        f"{signed(low)} to {signed(high)} mm. Of {len(change)} options {len(beyond)} leave that range: "
+        f"- Other random draws change the mean waypoint error ({judged['judge'].iloc[0]}; n = {len(pairs)} pairs) by "
+        f"{signed(low)} to {signed(high)} mm. Of {n_others} options {len(beyond)} leave that range: "
         f"{listed or 'none'}.\n"
-        f"- All nodes in every local fit, which makes the method rigid, changes it by "
-        f"{signed(change.xs(RIGID, level='option').iloc[0])} mm.\n"
-        f"- The {AS_AUTHORS} together change it by {signed(all_of_it)} mm, which is "
+        f"- All nodes in every local fit, which makes the method rigid, changes it by {signed(rigid)} mm.\n"
+        f"- The {evaluation.AS_AUTHORS} together change it by {signed(all_of_it)} mm, which is "
         f"{'no more than' if low <= all_of_it <= high else 'more than'} other draws do."
     )
 )
 
 # %%
 assert len(g_ct) == len(g_us) == len(template), "a node keeps its number through both maps"
-assert set(table["case"]) == {" to ".join(pair) for pair in todo}, "every option must have run on every pair"
-assert table["value"].notna().all()
+runs = changed.groupby(["choice", "option"])["case"].agg(set)
+assert len(runs) == len(options), "every option must have run"
+assert all(cases == {" to ".join(pair) for pair in todo} for cases in runs), "every option must have run on every pair"
+assert changed["value"].notna().all()
 # Nodes lie some 5 mm apart and, on CT, inside tubes of 5 mm radius: that is how far a covered point may be from one. A
 # branch that was left out would leave its points an intercostal space, 20 mm and more, away.
 assert max(covered.values()) < 8.0, f"expected both clouds covered to within 8 mm, got {covered}"
-# Correspondence: the mean node of each part must lie nearest to that part of the labelled ultrasound cloud.
-labelled = patients[first[1]].labelled
-for part in Part:
-    if part != Part.UNKNOWN:
-        middle = g_us.nodes[g_us.parts == part].mean(axis=0)
-        distance = {other: np.linalg.norm(labelled.only(other).mean(axis=0) - middle) for other in Part if other >= 0}
-        assert min(distance, key=distance.get) == part, (
-            f"nodes of {part.name} lie on {min(distance, key=distance.get).name}"
-        )
-rigid = others[others["option"] == RIGID]["change"].mean()
 # A rigid fit cannot follow what differs between people after coarse alignment, some millimetres; 0.2 mm is several
 # times what other draws of the maps change.
-assert rigid > 0.2, f"expected all nodes in every fit to cost more than 0.2 mm, got {rigid:+.2f} mm"
+costs = changed.loc[changed["option"] == evaluation.RIGID, "change"].mean()
+assert costs > 0.2, f"expected all nodes in every fit to cost more than 0.2 mm, got {costs:+.2f} mm"
+
+# %% [markdown]
+# Correspondence: the mean node of each part must lie nearest to that part of the labelled ultrasound cloud.
+
+# %%
+labelled = patients[first.target].labelled
+parts = [part for part in Part if part != Part.UNKNOWN]
+middles = {part: labelled.only(part).mean(axis=0) for part in parts}
+for part in parts:
+    middle = g_us.nodes[g_us.parts == part].mean(axis=0)
+    nearest = min(parts, key=lambda other: np.linalg.norm(middles[other] - middle))
+    assert nearest == part, f"nodes of {part.name} lie on {nearest.name}"

@@ -18,25 +18,12 @@ seed = 0
 # %%
 import numpy as np
 import pandas as pd
-from IPython.display import Markdown, display
+from IPython.display import Markdown
 
-from study import METHODS, figures
-from study.coarse import align
-from study.cohorts import load_anatomy, make_patient, pairs, truth_map
-from study.metrics import (
-    directed_distances_mm,
-    hausdorff_mm,
-    hd95_mm,
-    mean_surface_distance_mm,
-    population_sd,
-    waypoint_errors_mm,
-)
-from study.params import check_parameters, find_profile
-from study.pipeline import named_rng, register_aligned
-from study.waypoints import intercostal_waypoints
+from study import METHODS, datasets, evaluation, figures, params, pipeline
 
-check_parameters(globals(), dataset=str, profile=str, seed=int)
-params = find_profile(profile)
+params.check_parameters(globals(), dataset=str, profile=str, seed=int)
+data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
 pd.options.display.max_colwidth = None
 
 # %% [markdown]
@@ -45,13 +32,12 @@ pd.options.display.max_colwidth = None
 # in the frame of a tracker whose base may be anywhere.
 
 # %%
-source, target = pairs(dataset, params)[0]
-anatomy = load_anatomy(dataset, source, params, seed)
-patient = make_patient(load_anatomy(dataset, target, params, seed), params, seed)
-alignment = align(anatomy.cloud, patient.cloud)
-T_us_chest = alignment.target.T_cloud_chest
-us = alignment.target.cloud.points
-pd.DataFrame({"points": [len(anatomy.cloud), len(us)]}, index=[f"CT of {source}", f"US of {target}, simulated"])
+source, target = data.pairs()[0]
+patient = data.patient(target)
+pair = data.pair(data.anatomy(source), patient)
+ct, us = pair.alignment.source.cloud.points, pair.alignment.target.cloud.points
+T_us_chest = pair.alignment.target.T_cloud_chest
+pd.DataFrame({"points": [len(ct), len(us)]}, index=[f"CT of {source}", f"US of {target}, simulated"])
 
 # %% [markdown]
 # ## Every method from the same start
@@ -62,9 +48,10 @@ pd.DataFrame({"points": [len(anatomy.cloud), len(us)]}, index=[f"CT of {source}"
 
 # %%
 results = {
-    name: register_aligned(alignment, method, named_rng(seed, f"{source}/{target}/{name}"))
+    name: pipeline.register_aligned(pair.alignment, method, data.rng(f"{pair.name}/{name}"))
     for name, method in METHODS.items()
 }
+judged = {name: evaluation.Judgement(pair, result, data.params.radius_mm) for name, result in results.items()}
 pd.DataFrame(
     {
         name: {
@@ -96,13 +83,13 @@ figures.registration_grid({name: result.warped for name, result in results.items
 surface = pd.DataFrame(
     {
         name: {
-            "HD (Eq. 5)": hausdorff_mm(result.warped, us),
-            "HD, 95 %": hd95_mm(result.warped, us),
-            "mean": mean_surface_distance_mm(result.warped, us),
-            "CT to US, largest": directed_distances_mm(result.warped, us).max(),
-            "US to CT, largest": directed_distances_mm(us, result.warped).max(),
+            "HD (Eq. 5)": judgement.surface.hausdorff_mm,
+            "HD, 95 %": judgement.surface.hd95_mm,
+            "mean": judgement.surface.mean_mm,
+            "CT to US, largest": judgement.surface.forth.max(),
+            "US to CT, largest": judgement.surface.back.max(),
         }
-        for name, result in results.items()
+        for name, judgement in judged.items()
     }
 ).T
 surface.round(2)
@@ -114,8 +101,8 @@ surface.round(2)
 # patient's own cloud (k-means parts of each cartilage, midpoints between neighbours); magenta lines are the errors.
 
 # %%
-moved = {name: result.transfer(anatomy.waypoints.points, params.radius_mm) for name, result in results.items()}
-protocol = intercostal_waypoints(patient.labelled)
+moved = {name: judgement.moved for name, judgement in judged.items()}
+protocol = evaluation.intercostal_waypoints(patient.labelled)
 figures.transferred_path(us, protocol, moved, T_us_chest=T_us_chest)
 
 # %% [markdown]
@@ -126,23 +113,23 @@ figures.transferred_path(us, protocol, moved, T_us_chest=T_us_chest)
 
 # %%
 normal = T_us_chest.rotation[:, 2]
-truth = truth_map(dataset, anatomy, target)
-goals = {"protocol": protocol.points}
-if truth is not None:
-    goals["truth"] = patient.T_us_ras.apply(truth(anatomy.waypoints.points))
-errors = pd.DataFrame(
-    {
-        (judge, what): {name: value for name, points in moved.items() for value in [measure(points, goal)]}
-        for judge, goal in goals.items()
-        for what, measure in {
-            "mean (mm)": lambda points, goal: waypoint_errors_mm(points, goal).mean(),
-            "SD (mm)": lambda points, goal: population_sd(waypoint_errors_mm(points, goal)),
-            "largest (mm)": lambda points, goal: waypoint_errors_mm(points, goal).max(),
-            "in the plane (mm)": lambda points, goal: waypoint_errors_mm(points, goal, normal).mean(),
-            "depth (mm)": lambda points, goal: ((points - goal) @ normal).mean(),
-        }.items()
+goals = {"protocol": protocol.points} | ({"truth": pair.true_waypoints} if pair.has_truth else {})
+
+
+def described(points, goal):
+    """How far carried waypoints lie from where they should, in numbers."""
+    whole, inside = (evaluation.waypoint_errors_mm(points, goal, plane) for plane in (None, normal))
+    return {
+        "mean (mm)": whole.mean(),
+        "SD (mm)": evaluation.population_sd(whole),
+        "largest (mm)": whole.max(),
+        "in the plane (mm)": inside.mean(),
+        "depth (mm)": ((points - goal) @ normal).mean(),
     }
-)
+
+
+by_goal = {goal: pd.DataFrame({n: described(p, goals[goal]) for n, p in moved.items()}).T for goal in goals}
+errors = pd.concat(by_goal, axis="columns")
 errors.assign(n=len(protocol)).round(2)
 
 # %% [markdown]
@@ -152,30 +139,30 @@ errors.assign(n=len(protocol)).round(2)
 
 # %%
 is_rigid = {  # to rounding
-    name: np.allclose(result.warped, result.T_us_ct.apply(anatomy.cloud.points), rtol=0, atol=1e-6)
-    for name, result in results.items()
+    name: np.allclose(result.warped, result.T_us_ct.apply(ct), rtol=0, atol=1e-6) for name, result in results.items()
 }
-if truth is None:
-    display(Markdown(f"`{dataset}`: two real people, the true correspondence is not known, so nothing to see here."))
-else:
-    rigid, bends = ([name for name in moved if is_rigid[name] == wanted] for wanted in (True, False))
-    planes = {judge: errors[judge, "in the plane (mm)"] for judge in goals}
-    better = [name for name in bends if all(e[name] < e[rigid].min() for e in planes.values())]
-    named = {True: ", ".join(f"`{n}`" for n in better), False: ", ".join(f"`{n}`" for n in bends if n not in better)}
-    seen, best = errors["truth"], errors["protocol", "mean (mm)"].idxmin()
-    truest, levelled = seen["mean (mm)"].idxmin(), seen["depth (mm)"].abs().idxmin()
-    display(
-        Markdown(
-            f"- In the feature plane, of the methods that bend, these beat every rigid one by either judge: "
-            f"{named[True] or 'none'}. These do not: {named[False] or 'none'}.\n"
-            f"- Best by the protocol: `{best}`, {errors.loc[best, ('protocol', 'mean (mm)')]:.1f} mm. By the truth it "
-            f"errs by {seen.loc[best, 'mean (mm)']:.1f} mm, with a mean depth error of "
-            f"{seen.loc[best, 'depth (mm)']:+.1f} mm.\n"
-            f"- Best by the truth: `{truest}`, {seen.loc[truest, 'mean (mm)']:.1f} mm, where the protocol sees "
-            f"{errors.loc[truest, ('protocol', 'mean (mm)')]:.1f} mm. Least wrong in depth: `{levelled}`, "
-            f"{seen.loc[levelled, 'depth (mm)']:+.1f} mm."
-        )
+rigid, bends = ([name for name in moved if is_rigid[name] == wanted] for wanted in (True, False))
+planes = [errors[goal, "in the plane (mm)"] for goal in goals]
+better = [name for name in bends if all(plane[name] < plane[rigid].min() for plane in planes)]
+named = {True: ", ".join(f"`{n}`" for n in better), False: ", ".join(f"`{n}`" for n in bends if n not in better)}
+
+# %%
+text = f"`{data.name}`: two real people, the true correspondence is not known, so nothing to see here."
+if pair.has_truth:
+    ours, seen = errors["protocol"], errors["truth"]
+    best, truest = ours["mean (mm)"].idxmin(), seen["mean (mm)"].idxmin()
+    levelled = seen["depth (mm)"].abs().idxmin()
+    text = (
+        f"- In the feature plane, of the methods that bend, these beat every rigid one by either judge: "
+        f"{named[True] or 'none'}. These do not: {named[False] or 'none'}.\n"
+        f"- Best by the protocol: `{best}`, {ours.loc[best, 'mean (mm)']:.1f} mm. By the truth it "
+        f"errs by {seen.loc[best, 'mean (mm)']:.1f} mm, with a mean depth error of "
+        f"{seen.loc[best, 'depth (mm)']:+.1f} mm.\n"
+        f"- Best by the truth: `{truest}`, {seen.loc[truest, 'mean (mm)']:.1f} mm, where the protocol sees "
+        f"{ours.loc[truest, 'mean (mm)']:.1f} mm. Least wrong in depth: `{levelled}`, "
+        f"{seen.loc[levelled, 'depth (mm)']:+.1f} mm."
     )
+Markdown(text)
 
 # %% [markdown]
 # ## What this shows
@@ -186,9 +173,9 @@ else:
 # %%
 assert list(results) == list(METHODS), "every method must have answered"
 for name, result in results.items():
-    assert result.warped.shape == anatomy.cloud.points.shape, f"{name}: expected one row per CT point"
+    assert result.warped.shape == ct.shape, f"{name}: expected one row per CT point"
     if is_rigid[name]:
-        carried = result.T_us_ct.apply(anatomy.waypoints.points)
+        carried = result.T_us_ct.apply(pair.waypoints_ct)
         # A rigid fit to exactly paired points has no error but rounding: coordinates of some 1,000 mm in float64.
         assert np.abs(moved[name] - carried).max() < 1e-6, f"{name}: a rigid path must be its own motion"
 graph, start = ("skeleton_graph", "coarse")
@@ -196,7 +183,7 @@ in_plane = errors[list(goals)[-1], "in the plane (mm)"]  # by the truth, if it i
 # The issue of this study asks 2.5 mm in the feature plane; the quick profile has a third of the points, and two real
 # people differ in more than the phantom's deformations do, so there it must only improve on its start.
 assert in_plane[graph] < in_plane[start], f"expected an improvement on the coarse alignment, got {in_plane.to_dict()}"
-if dataset == "phantom" and profile == "full":
+if data.people == "synthetic" and profile == "full":
     assert in_plane[graph] <= 2.5, f"expected at most 2.5 mm in the feature plane, got {in_plane[graph]:.2f}"
 # ICP minimises distances, so its clouds cannot be farther apart than where it started; 0.05 mm is that metric's
 # tolerance between machines.

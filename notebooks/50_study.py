@@ -16,31 +16,11 @@ profile = "full"  # full or quick
 seed = 0
 
 # %%
-from study.params import check_parameters, find_profile
-
-check_parameters(globals(), dataset=str, profile=str, seed=int)
-
-import json
-import os
-
 import pandas as pd
 
-from study import figures
-from study.batch import load_or_run
-from study.metrics import METRICS, TRUTH, population_sd
-from study.results import (
-    CASE,
-    ROOT,
-    beside_paper,
-    hd_table,
-    paper_hd_table,
-    paper_waypoints,
-    run_folder,
-    waypoint_summary,
-    write_bytes,
-)
+from study import batch, evaluation, figures, params, results
 
-params = find_profile(profile)
+params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 pd.options.display.max_colwidth = None
 
 # %% [markdown]
@@ -49,32 +29,15 @@ pd.options.display.max_colwidth = None
 # the two happened is said below.
 
 # %%
-folder = run_folder(dataset, profile, seed)
-metrics, origin = load_or_run(dataset, params, folder, seed=seed, n_jobs=min(2, os.cpu_count() or 1))
-record = json.loads((folder / "provenance.json").read_text())
-cases = metrics.drop_duplicates(["subject", "target", "method"])
-pd.Series(
-    {
-        "from": origin,
-        "folder": folder.relative_to(ROOT).as_posix(),
-        "finished": record["finished"],
-        "seconds": round(record["seconds"]),
-        "pairs": len(cases.drop_duplicates(["subject", "target"])),
-        "methods": ", ".join(dict.fromkeys(figures.in_order(metrics["method"]))),
-        "cases": len(cases),
-        "cases that failed": int((metrics["metric"] == CASE).sum()),
-        "rows": len(metrics),
-    },
-    name=dataset,
-).to_frame()
+run = batch.open_run(dataset, profile, seed)
+run.overview().to_frame()
 
 # %% [markdown]
 # A case that fails is a row with its reason, not a gap:
 
 # %%
-failures = metrics.loc[metrics["metric"] == CASE, ["subject", "target", "method", "status"]].reset_index(drop=True)
-reasons = failures.groupby(["subject", "target", "status"])["method"].agg(lambda names: f"{len(names)} methods")
-reasons.reset_index() if len(failures) else "no case failed"
+reasons = run.failures.groupby(["source", "target", "reason"])["method"].agg(lambda names: f"{len(names)} methods")
+reasons.reset_index() if len(reasons) else "no case failed"
 
 # %% [markdown]
 # ## Hausdorff distance, in the shape of Table I
@@ -84,16 +47,16 @@ reasons.reset_index() if len(failures) else "no case failed"
 # front that was swept.
 
 # %%
-one_ct = metrics["subject"].nunique() == 1
-by_column = metrics.assign(subject=metrics["target"]) if one_ct else metrics
-table = hd_table(by_column)
-display, table_note = beside_paper(table)
+table = run.hd_table()
+display, table_note = results.beside_paper(table)
 print(table_note)
 display
 
 # %%
-what = "simulated patient" if one_ct or metrics["target"].nunique() == 1 else "each of the others as simulated patient"
-drawn = {"hausdorff": figures.hd_bars(by_column, paper=paper_hd_table(), note=what)}
+by_column = run.by_column()
+one_patient = by_column["target"].nunique() == 1 or by_column["source"].equals(by_column["target"])
+what = "simulated patient" if one_patient else "each of the others as simulated patient"
+drawn = {"hausdorff": figures.hd_bars(by_column, paper=results.paper_hd_table(), note=what)}
 drawn["hausdorff"]
 
 # %% [markdown]
@@ -111,11 +74,11 @@ drawn["surface_distance"]
 # CTs stand at the right.
 
 # %%
-drawn["waypoints"] = figures.waypoint_boxes(by_column, paper=paper_waypoints(), note=what)
+drawn["waypoints"] = figures.waypoint_boxes(by_column, paper=results.paper_waypoints(), note=what)
 drawn["waypoints"]
 
 # %%
-summary = waypoint_summary(metrics)
+summary = run.waypoint_summary()
 counts = ["n_waypoints", "n_cases", "n_failed"]
 shown = summary[summary["metric"] == "waypoint_error"].drop(columns="metric").set_index("method")
 shown.round(2).astype(dict.fromkeys(counts, int)).rename(
@@ -128,27 +91,17 @@ shown.round(2).astype(dict.fromkeys(counts, int)).rename(
 
 # %%
 VIEWS = ["waypoint_error", "waypoint_error_inplane", "true_waypoint_error_inplane", "true_waypoint_error"]
-drawn["judges"] = figures.error_views(metrics, VIEWS, note=what)
+drawn["judges"] = figures.error_views(run.metrics, VIEWS, note=what)
 drawn["judges"]
 
 # %% [markdown]
 # Every metric of the run, as mean ± population SD over the pairs (a pair's waypoints are averaged first), with n.
 
 # %%
-per_pair = metrics[metrics["metric"] != CASE].groupby(["metric", "method", "subject", "target"])["value"].mean()
-spread = per_pair.groupby(["metric", "method"]).agg(["mean", population_sd, "size"])
-text = spread.apply(lambda row: f"{row['mean']:.2f} ± {row['population_sd']:.2f} (n={row['size']:.0f})", axis=1)
-order = [name for name in METRICS if name in text.index.get_level_values("metric")]
-text.unstack("metric").reindex(index=table.index, columns=order).fillna("failed").rename(
-    columns={name: f"{METRICS[name].title} ({METRICS[name].unit})" for name in order}
-).T
+run.summary()
 
 # %%
-for name, figure in drawn.items():
-    write_bytes(folder / f"{name}.png", figures.png(figure))
-print(
-    "figures:", ", ".join(sorted(path.name for path in folder.glob("*.png"))), "in", folder.relative_to(ROOT).as_posix()
-)
+run.keep_figures({name: figures.png(figure) for name, figure in drawn.items()})
 
 # %% [markdown]
 # ## What this shows
@@ -157,10 +110,11 @@ print(
 # tuned, is in the tables above; notebook 60 puts it beside the paper's claims.
 
 # %%
-methods = [*record["parameters"]["methods"], *([TRUTH] if TRUTH in table.index else [])]
+methods = [*run.provenance["parameters"]["methods"], *([evaluation.TRUTH] if run.has_truth else [])]
 assert set(table.index) == set(methods), "every method of the run must be in the table"
 assert (table["n"] + table["n_failed"] > 0).all(), "a method without a value or a failure was never run"
-assert len(cases) == len(methods) * len(cases.drop_duplicates(["subject", "target"])), "every method on every pair"
+cases = run.metrics.drop_duplicates(["source", "target", "method"])
+assert len(cases) == len(methods) * run.n_pairs, "every method on every pair"
 mean = shown["mean"]
 # Adapting to a person's shape is what the method is for: with no margin at all it must beat the two that cannot, on the
 # mean of 20 waypoints of every pair. The same pairs must stand behind the means: what the coarse alignment refused is

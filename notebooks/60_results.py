@@ -15,37 +15,14 @@ profile = "full"  # full or quick
 seed = 0
 
 # %%
-from study.params import check_parameters, find_profile
-
-check_parameters(globals(), dataset=str, profile=str, seed=int)
-
-import json
-import os
-
 import pandas as pd
 from IPython.display import Markdown, display
 
-from study import figures
-from study.batch import load_or_run, run_parameters
-from study.cohorts import load_anatomy, pairs
-from study.errors import StudyError
-from study.metrics import METRICS, TRUTH, hausdorff_mm, paired_wilcoxon, population_sd, sampling_floor_mm
-from study.pipeline import named_rng
-from study.results import (
-    CASE,
-    REFERENCE,
-    ROOT,
-    compare,
-    paper_hd_table,
-    paper_waypoints,
-    read_metrics,
-    run_folder,
-    why_stale,
-    write_bytes,
-)
+from study import batch, datasets, evaluation, figures, params, results
 
-params = find_profile(profile)
+params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 pd.options.display.max_colwidth = None
+GRAPH, TRUTH = evaluation.GRAPH, evaluation.TRUTH
 
 # %% [markdown]
 # ## What has been run
@@ -53,37 +30,24 @@ pd.options.display.max_colwidth = None
 # table says so. `as now` means that code, parameters and methods of the run are those of this checkout.
 
 # %%
-load_or_run(dataset, params, run_folder(dataset, profile, seed), seed=seed, n_jobs=min(2, os.cpu_count() or 1))
-folders = {}
-for name in dict.fromkeys((dataset, "phantom", "planted", "open")):
-    places = [run_folder(name, profile, seed)] + ([REFERENCE / name] if (profile, seed) == ("full", 0) else [])
-    found = [place for place in places if (place / "metrics.csv").is_file()]
-    if found:
-        folders[name] = found[0]
-runs = {name: read_metrics(folder / "metrics.csv") for name, folder in folders.items()}
-about = {}
-for name, folder in folders.items():
-    rows, stale = runs[name], why_stale(folder, run_parameters(params), seed)
-    made = json.loads((folder / "provenance.json").read_text())
-    about[name] = {
-        "from": folder.relative_to(ROOT).as_posix(),
-        "state": "as now" if stale is None else stale,
-        "commit": (made["commit"] or "none")[:10],
-        "CTs": rows["subject"].nunique(),
-        "patients": rows["target"].nunique(),
-        "pairs": len(rows.drop_duplicates(["subject", "target"])),
-        "cases": len(rows.drop_duplicates(["subject", "target", "method"])),
-        "failed": int((rows["metric"] == CASE).sum()),
-    }
-pd.DataFrame(about).T
+batch.open_run(dataset, profile, seed)
+found = {name: results.newest(name, profile, seed) for name in dict.fromkeys((dataset, *datasets.reported()))}
+runs = {name: run for name, run in found.items() if run is not None}
+about = pd.DataFrame({name: run.overview() for name, run in runs.items()}).drop(
+    ["from", "finished", "seconds", "methods"]
+)
+data = {name: datasets.find_dataset(name, params.find_profile(profile), seed) for name in runs}
+stale = {name: run.why_stale(batch.run_parameters(data[name]), seed) for name, run in runs.items()}
+about.loc["state"] = [stale[name] or "as now" for name in runs]
+about.T
 
 # %% [markdown]
 # Cases that failed, with their reasons: a pair that the coarse alignment refuses is lost to every method.
 
 # %%
-lost = pd.concat([rows[rows["metric"] == CASE] for rows in runs.values()])
-print(f"{len(lost)} of {sum(entry['cases'] for entry in about.values())} cases failed")
-lost.groupby(["dataset", "subject", "target", "status"]).size().rename("cases").reset_index().set_index("dataset")
+lost = pd.concat([run.failures.assign(dataset=name) for name, run in runs.items()])
+print(f"{len(lost)} of {about.loc['cases'].sum()} cases failed")
+lost.groupby(["dataset", "source", "target", "reason"]).size().rename("cases").reset_index().set_index("dataset")
 
 # %% [markdown]
 # ## The two measures of the paper
@@ -98,29 +62,19 @@ lost.groupby(["dataset", "subject", "target", "status"]).size().rename("cases").
 # perfect: by that measure it is rewarded for something else. That numbers come close to the paper's is chance; its data
 # are other people.
 
+
 # %%
-everything = pd.concat(runs.values(), ignore_index=True)
-done = everything[everything["metric"] != CASE]
-per_pair = done.groupby(["dataset", "metric", "method", "subject", "target"])["value"].mean()
-methods = figures.in_order(everything["method"])
-methods_only = [name for name in methods if name != TRUTH]
-
-
 def overview(metric, paper):
     """Mean ± SD (n) of a metric, methods by data sets, the paper's beside them."""
-    cells = {}
-    for name in runs:
-        values = per_pair.get(name, {}).get(metric)
-        if values is None:
-            continue
-        groups = values.groupby("method")
-        cells[name] = groups.apply(lambda v: f"{v.mean():.2f} ± {population_sd(v):.2f} (n={len(v)})")
+    title = f"{evaluation.METRICS[metric].title} ({evaluation.METRICS[metric].unit})"
+    cells = {name: run.summary().loc[title] for name, run in runs.items()}
     cells["paper, other data"] = paper.apply(lambda row: f"{row['mean']:.2f} ± {row['sd']:.2f} (n={row['n']})", axis=1)
-    return pd.DataFrame(cells).reindex(methods).fillna("–").rename_axis(METRICS[metric].title)
+    methods = results.in_order(name for run in runs.values() for name in run.methods)
+    return pd.DataFrame(cells).reindex(methods).fillna("–").rename_axis(title)
 
 
-display(overview("hd", paper_hd_table()))
-display(overview("waypoint_error", paper_waypoints()))
+display(overview("hd", results.paper_hd_table()))
+display(overview("waypoint_error", results.paper_waypoints()))
 
 # %% [markdown]
 # ## Pair by pair
@@ -129,22 +83,12 @@ display(overview("waypoint_error", paper_waypoints()))
 # Hausdorff distance.
 
 # %%
-GRAPH = "skeleton_graph"
-
-
-def differences(metric, reference=GRAPH):
-    """``reference`` minus every other method on each pair where both have a value."""
-    parts = []
-    for name in runs:
-        table = per_pair[name, metric].unstack("method")
-        for other in [name for name in methods_only if name in table.columns and name != reference]:
-            both = table[[reference, other]].dropna()
-            parts.append(pd.DataFrame({"dataset": name, "method": other, "difference": both[reference] - both[other]}))
-    return pd.concat(parts, ignore_index=True)
-
-
+per_pair = {name: run.per_pair for name, run in runs.items()}
+methods_only = {name: table.drop(columns=TRUTH, errors="ignore") for name, table in per_pair.items()}
 drawn = {
-    f"against_{metric}": figures.paired_differences(differences(metric), GRAPH, METRICS[metric].title)
+    f"against_{metric}": figures.paired_differences(
+        evaluation.differences(methods_only, metric), GRAPH, evaluation.METRICS[metric].title
+    )
     for metric in ("waypoint_error", "hd")
 }
 display(*drawn.values())
@@ -157,35 +101,14 @@ display(*drawn.values())
 
 
 # %%
-def significance(p):
-    """A p-value as text; none where there was no test."""
-    return "" if p is None else ", p < 0.001" if p < 5e-4 else f", p = {p:.3f}"
-
-
-tests = []
-for reference in [name for name in methods if name.startswith(GRAPH)]:
-    for metric in ("hd", "waypoint_error", "true_waypoint_error_inplane"):
-        for name in runs:
-            if (name, metric) not in per_pair.index.droplevel(["method", "subject", "target"]):
-                continue
-            table = per_pair[name, metric].unstack("method")
-            for other in [column for column in methods_only if column in table.columns and column != reference]:
-                both = table[[reference, other]].dropna()
-                test = paired_wilcoxon(both[reference], both[other])
-                tests.append(
-                    {
-                        "method": reference,
-                        "metric": METRICS[metric].title,
-                        "against": other,
-                        "dataset": name,
-                        "verdict": f"{test.mean_difference:+.2f} mm, better on {(both[reference] < both[other]).sum()} "
-                        f"of {test.n}" + significance(test.p_value),
-                    }
-                )
-tests = pd.DataFrame(tests)
-tests.pivot(index=["method", "metric", "against"], columns="dataset", values="verdict").reindex(
-    pd.MultiIndex.from_frame(tests[["method", "metric", "against"]].drop_duplicates())
-)[list(runs)].fillna("–")
+variants = [name for name in results.in_order(per_pair[dataset].columns) if name.startswith(GRAPH)]
+tested = ("hd", "waypoint_error", "true_waypoint_error_inplane")
+tests = pd.concat(
+    [evaluation.paired_tests(methods_only, metric, name) for name in variants for metric in tested], ignore_index=True
+)
+order = pd.MultiIndex.from_frame(tests[["method", "metric", "against"]].drop_duplicates())
+wide = tests.pivot(index=["method", "metric", "against"], columns="dataset", values="verdict")
+wide.reindex(order)[list(runs)].fillna("–")
 
 # %% [markdown]
 # ## What the protocol hides
@@ -196,9 +119,9 @@ tests.pivot(index=["method", "metric", "against"], columns="dataset", values="ve
 
 # %%
 VIEWS = ["waypoint_error", "waypoint_error_inplane", "true_waypoint_error_inplane", "true_waypoint_error"]
-known = [name for name in runs if "true_waypoint_error" in set(runs[name]["metric"])]
+known = [name for name, run in runs.items() if run.has_truth]
 for name in known:
-    drawn[f"protocol_{name}"] = figures.error_views(runs[name], VIEWS, note=f"{name}, simulated patient")
+    drawn[f"protocol_{name}"] = figures.error_views(runs[name].metrics, VIEWS, note=f"{name}, simulated patient")
     display(drawn[f"protocol_{name}"])
 
 # %% [markdown]
@@ -209,25 +132,10 @@ for name in known:
 # protocol calls them worse.
 
 # %%
-KEYS = ["dataset", "method", "subject", "target", "index"]
-single = done[done["metric"].isin(VIEWS)].pivot(index=KEYS, columns="metric", values="value").loc[known]
-single["in depth"] = (single["true_waypoint_error"] ** 2 - single["true_waypoint_error_inplane"] ** 2).clip(0) ** 0.5
-split = (
-    single.groupby(["dataset", "method"])
-    .mean()
-    .rename(
-        columns={
-            "waypoint_error": "protocol",
-            "true_waypoint_error": "true",
-            "true_waypoint_error_inplane": "true, in the plane",
-            "in depth": "true, in depth",
-        }
-    )
-)
-split["hidden"] = split["true"] - split["protocol"]
-split["n"] = single.groupby(["dataset", "method"]).size()
-order = [(name, method) for name in known for method in methods if (name, method) in split.index]
-split.loc[order, ["protocol", "true", "true, in the plane", "true, in depth", "hidden", "n"]].round(2)
+split = evaluation.protocol_and_truth({name: runs[name].values for name in known})
+order = [(name, method) for name in known for method in runs[name].methods]
+split = split.loc[order]
+split.round(2)
 
 # %% [markdown]
 # ## The floor of a Hausdorff distance
@@ -236,15 +144,17 @@ split.loc[order, ["protocol", "true", "true, in the plane", "true, in depth", "h
 # shows the floor of both beside the spread of the methods it has to separate.
 
 # %%
-source = pairs(dataset, params)[0][0]
-cloud = load_anatomy(dataset, source, params, seed).cloud.points
-dense = load_anatomy(dataset, source, params, seed + 1).cloud.points
+people = data[dataset]
+source = people.pairs()[0][0]
+again = datasets.find_dataset(dataset, people.params, seed + 1)
+cloud, dense = (one.anatomy(source).cloud.points for one in (people, again))
 drawn_points = min(1600, len(cloud) // 2)
-means_hd = per_pair[dataset, "hd"].groupby("method").mean()
+means_hd = per_pair[dataset].loc["hd"].mean()
 of_methods = means_hd.drop(TRUTH, errors="ignore")
+sampled = evaluation.sampling_floor_mm(cloud, drawn_points, people.rng("floor"))
 floor = {
-    f"floor, {drawn_points:,} random points a cloud": sampling_floor_mm(cloud, drawn_points, named_rng(seed, "floor")),
-    f"floor, two samples of all {len(cloud):,} points": hausdorff_mm(cloud, dense),
+    f"floor, {drawn_points:,} random points a cloud": sampled,
+    f"floor, two samples of all {len(cloud):,} points": evaluation.hausdorff_mm(cloud, dense),
     f"best method of {dataset}, mean": of_methods.min(),
     f"worst method of {dataset}, mean": of_methods.max(),
 }
@@ -260,77 +170,18 @@ pd.Series(floor, name="Hausdorff distance (mm)").round(2).to_frame()
 # moves a cloud in millimetres.
 
 # %%
-BASELINES = ["icp", "nonrigid_icp", "cpd"]
-TUNED = [name for name in methods if name.endswith("_tuned") and not name.startswith(GRAPH)]
-worst = done.groupby(["dataset", "metric", "method", "subject", "target"])["value"].max()
-
-
-def share(values, best, rivals, *, least=True):
-    """On how many pairs ``best`` is below (or above) every rival."""
-    table = values.unstack("method")
-    rivals = [name for name in rivals if name in table.columns and name != best]
-    if best not in table.columns or not rivals:
-        return "–"
-    table = table[[best, *rivals]].dropna()
-    ahead = table[best] < table[rivals].min(axis=1) if least else table[best] > table[rivals].max(axis=1)
-    return f"{int(ahead.sum())} of {len(table)}"
-
-
-def verdicts(name):
-    """What a data set says to each claim."""
-    hd, path = per_pair[name, "hd"], per_pair[name, "waypoint_error"]
-    published = [GRAPH, *BASELINES]
-    spread = hd.groupby("method").agg(population_sd).reindex(published)
-    means = path.groupby("method").mean().reindex(published)
-    outcome = {
-        "smallest Hausdorff distance on every CT": share(hd, GRAPH, BASELINES),
-        "steadiest: smallest SD of the Hausdorff distance": "yes"
-        if spread.idxmin() == GRAPH
-        else f"no, {spread.idxmin()}",
-        "smallest mean waypoint error": "yes" if means.idxmin() == GRAPH else f"no, {means.idxmin()}",
-        "smallest mean waypoint error on every CT": share(path, GRAPH, BASELINES),
-        "smallest maximum waypoint error on every CT": share(worst[name, "waypoint_error"], GRAPH, BASELINES),
-        "ICP worst on most CTs, by waypoint error": share(path, "icp", published, least=False),
-        "not asked: Hausdorff distance below tuned baselines, too": share(hd, GRAPH, TUNED),
-        "not asked: waypoint error below tuned baselines, too": share(path, GRAPH, TUNED),
-        "not asked: best by the truth": "–",
-        "not asked: best by the truth, tuned baselines too": "–",
-    }
-    if name in known:
-        true = per_pair[name, "true_waypoint_error"]
-        outcome["not asked: best by the truth"] = share(true, GRAPH, BASELINES)
-        outcome["not asked: best by the truth, tuned baselines too"] = share(true, GRAPH, TUNED)
-    return outcome
-
-
-PAPER_SAYS = {"smallest mean waypoint error": "yes", "steadiest: smallest SD of the Hausdorff distance": "yes"}
-claims = pd.DataFrame({name: verdicts(name) for name in runs})
-claims.insert(0, "paper", [PAPER_SAYS.get(claim, "–" if "not asked" in claim else "5 of 5") for claim in claims.index])
-claims.loc["ICP worst on most CTs, by waypoint error", "paper"] = "4 of 5"
-
-
-def verdict(outcomes):
-    """Whether a claim holds: on every pair of every data set, on most, or not."""
-    shares = []
-    for text in outcomes[outcomes != "–"]:
-        ahead, _, of = text.partition(" of ")
-        shares.append(int(ahead) / int(of) if of.isdigit() else float(text.startswith("yes")))
-    return "yes" if min(shares) == 1 else "mostly" if sum(shares) / len(shares) > 0.5 else "no"
-
-
-claims["here"] = claims[list(runs)].apply(verdict, axis=1)
-claims.rename_axis("claim: the skeleton graph has the …")
+claims = evaluation.claims_table({name: run.values for name, run in runs.items()})
+claims
 
 # %% [markdown]
 # Time of a registration, mean seconds a pair on the machine of the run. The paper reports about 20 minutes for CPD.
 
 # %%
-timings = {
-    name: pd.read_csv(folder / "timings.csv").query("stage == 'register'").groupby("method")["seconds"].mean()
-    for name, folder in folders.items()
-    if (folder / "timings.csv").is_file()
+timed = {
+    name: run.timings[run.timings["stage"] == "register"].groupby("method")["seconds"].mean()
+    for name, run in runs.items()
 }
-pd.DataFrame(timings).reindex(methods_only).round(1)
+pd.DataFrame(timed).reindex(results.in_order(methods_only[dataset].columns)).round(1)
 
 # %% [markdown]
 # ## Against the committed reference
@@ -338,17 +189,8 @@ pd.DataFrame(timings).reindex(methods_only).round(1)
 # line).
 
 # %%
-for name, folder in folders.items():
-    try:
-        if folder == REFERENCE / name:
-            text = "this is the reference: no run of its own to compare"
-        elif (profile, seed) != ("full", 0):
-            text = "the reference is of the full profile and seed 0: not comparable"
-        else:
-            text = compare(REFERENCE / name, folder).report()
-    except StudyError as error:
-        text = f"no comparison: {error}".replace(f"{ROOT.as_posix()}/", "")
-    print(f"{name}: {text}")
+for name, run in runs.items():
+    print(f"{name}: {results.against_reference(run, comparable=(profile, seed) == ('full', 0))}")
 
 # %% [markdown]
 # ## Why we think this is a replication, and what stood in the way
@@ -371,21 +213,21 @@ for name, folder in folders.items():
 # - With five CTs the paper's comparison cannot reach significance by a paired test, whatever the numbers.
 
 # %%
-for name, figure in drawn.items():
-    write_bytes(run_folder(dataset, profile, seed).parent / f"{name}.png", figures.png(figure))
+results.keep_pictures(runs[dataset].folder.parent, {name: figures.png(figure) for name, figure in drawn.items()})
 summary = []
-for name in runs:
-    means = per_pair[name, "waypoint_error"].groupby("method").mean()
-    best = means[[method for method in methods_only if method in means]].idxmin()
+for name, run in runs.items():
+    values = methods_only[name].loc["waypoint_error"]
+    means, best = values.mean(), values.mean().idxmin()
     summary.append(
-        f"- `{name}` (n = {per_pair[name, 'waypoint_error', GRAPH].size} of {about[name]['pairs']} pairs registered): "
-        f"mean waypoint error of the skeleton graph as published "
-        f"{means[GRAPH]:.2f} mm, from {means['coarse']:.2f} mm after coarse alignment; smallest of all methods: "
-        f"`{best}` with {means[best]:.2f} mm."
+        f"- `{name}` (n = {values[GRAPH].count()} of {run.n_pairs} pairs registered): mean waypoint error of the "
+        f"skeleton graph as published {means[GRAPH]:.2f} mm, from {means['coarse']:.2f} mm after coarse alignment; "
+        f"smallest of all methods: `{best}` with {means[best]:.2f} mm."
     )
+
+# %%
 for name in known:
     row, best = split.loc[name, GRAPH], split.loc[name, "true"].drop(TRUTH).idxmin()
-    hd = per_pair[name, "hd"].groupby("method").mean()
+    hd = per_pair[name].loc["hd"].mean()
     summary.append(
         f"- `{name}`, by the truth: {row['true']:.2f} mm for the skeleton graph as published, "
         f"{row['true, in depth']:.2f} mm of it in depth and {row['true, in the plane']:.2f} mm in the feature plane, "
@@ -394,8 +236,10 @@ for name in known:
         f"{hd[TRUTH]:.2f} mm and {split.loc[(name, TRUTH), 'protocol']:.2f} mm by the protocol; the skeleton graph has "
         f"{hd[GRAPH]:.2f} and {row['protocol']:.2f} mm."
     )
-held = [claim for claim, here in claims["here"].items() if here == "yes" and "not asked" not in claim]
-asked = [claim for claim in claims.index if "not asked" not in claim]
+
+# %%
+asked = [claim.text for claim in evaluation.CLAIMS if claim.asked]
+held = [claim for claim in asked if claims.loc[claim, "here"] == "yes"]
 summary.insert(
     0,
     f"- Of the paper's {len(asked)} claims, {len(held)} hold here on every pair of every data set"
@@ -405,10 +249,10 @@ display(Markdown("\n".join(["## What this shows", *summary])))
 
 # %%
 assert dataset in runs, "the data set asked for must be there"
-for name in runs:
-    means = per_pair[name, "waypoint_error"].groupby("method").mean()
+for name, table in per_pair.items():
+    values = table.loc["waypoint_error"]
+    means, counts = values.mean(), values.count()
     # A pair that the coarse alignment refused is lost to every method; nothing else may be, or means would not compare.
-    counts = per_pair[name, "waypoint_error"].groupby("method").size()
     assert counts[GRAPH] == counts["coarse"] > 0, f"{name}: pairs behind the means differ: {counts.to_dict()}"
     # The paper's central claim against what cannot adapt to a person's shape; no margin, as any loss would refute it.
     for rigid in ("coarse", "icp"):

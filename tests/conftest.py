@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from study import phantom
-from study.types import ChestFrame, Part, PointCloud
+from study.alignment.frame import ChestFrame
+from study.types import Part, PointCloud
 
 US_NOISE_MM = 0.5
 

@@ -5,23 +5,32 @@ from __future__ import annotations
 import copy
 import io
 import re
+import tarfile
 import threading
 import time
 import zipfile
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import yaml
 
-from study.data.manifest import default_manifest_path
+from study.data.manifest import default_manifest_path, load_manifest
+from study.data.schema import Manifest
+from study.data.web import Web
 
 RIBFRAC_PATH = "/records/3893496/files/ribfrac-val-images.zip"
 TOTALSEGMENTATOR_PATH = "/records/10047263/files/Totalsegmentator_dataset_small_v201.zip"
 ZENODO = "https://zenodo.org"
+SCANS = (421, 441, 461, 481, 500)  # of cohort `ribseg`
+RANGE_BYTES = 1 << 16
+FAST = Web(attempts=4, backoff_s=0.001, range_bytes=RANGE_BYTES, timeout_s=5)
+
+Write = Callable[..., Manifest]
 
 
 @dataclass(frozen=True)
@@ -183,3 +192,30 @@ def rebased_manifest(target: Path, base_url: str, *, keep: Iterable[str], ribseg
                 source["sha256"] = ribseg_sha256
     target.write_text(yaml.safe_dump(raw, sort_keys=False), encoding="utf-8")
     return target
+
+
+def noise(seed: int, n_bytes: int = 300_000) -> bytes:
+    """Incompressible, as a .nii.gz is."""
+    return np.random.default_rng(seed).bytes(n_bytes)
+
+
+def manifest_of(tmp_path: Path, file: dict) -> Manifest:
+    ct = {"role": "ct", "title": "a scan", "licence": "CC0", "citation": "nobody"} | file
+    raw = {"files": {"ct": ct}, "cohorts": {"one": {"subjects": {"a": {"ct": "ct", "landmarks": "a.yaml"}}}}}
+    path = tmp_path / "my_manifest.yaml"
+    path.write_text(yaml.safe_dump(raw), encoding="utf-8")
+    return load_manifest(path)
+
+
+def sdist(members: dict[str, bytes], links: dict[str, str] | None = None) -> bytes:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w:gz") as archive:
+        for name, content in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            archive.addfile(info, io.BytesIO(content))
+        for name, target in (links or {}).items():
+            info = tarfile.TarInfo(name)
+            info.type, info.linkname = tarfile.SYMTYPE, target
+            archive.addfile(info)
+    return packed.getvalue()

@@ -6,8 +6,9 @@ from collections import deque
 
 import numpy as np
 
-from study.som import SomParams
-from study.types import Floats, Ints, SkeletonGraph
+from study.skeleton.graph import SkeletonGraph
+from study.skeleton.som import SomParams
+from study.types import Floats, Ints
 
 
 def hops_literal(n: int, edges: Ints, *, directed: bool) -> Ints:

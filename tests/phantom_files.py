@@ -11,9 +11,9 @@ import yaml
 
 from study import phantom
 from study.data.manifest import load_manifest
-from study.data.volumes import write_volume
+from study.files.volumes import write_volume
 from study.params import PHANTOM_SEED, StudyParams
-from study.pipeline import named_rng
+from study.seeds import named_rng
 from study.types import CARTILAGES, Part, Volume
 
 SPACING_MM = 2.5
@@ -22,11 +22,13 @@ SMALL = StudyParams(ct_points=2000, us_spacing_mm=3.0, phantom_spacing_mm=SPACIN
 
 @cache
 def scan(name: str) -> tuple[Volume, Volume]:
-    """The CT and its labels, as `study.cohorts.load_anatomy` draws them at `SPACING_MM`."""
+    """The CT and its labels, as `study.datasets.phantoms.PhantomDataset` draws them at `SPACING_MM`."""
     return _ct_volume(phantom.draw_subject(name, PHANTOM_SEED), SPACING_MM, named_rng(PHANTOM_SEED, f"ct/{name}"))
 
 
-def cached_ct_volume(drawn: phantom.Subject, spacing_mm: float, _rng: np.random.Generator) -> tuple[Volume, Volume]:
+def cached_ct_volume(
+    drawn: phantom.SyntheticSubject, spacing_mm: float, _rng: np.random.Generator
+) -> tuple[Volume, Volume]:
     """In place of `phantom.ct_volume`, whose noise is the same in every run."""
     assert spacing_mm == SPACING_MM
     return scan(drawn.name)

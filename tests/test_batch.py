@@ -10,14 +10,22 @@ import pandas as pd
 import pytest
 from phantom_files import SMALL, cached_ct_volume
 
+from study import METHODS as METHODS_BY_NAME
 from study import batch, phantom
-from study.batch import Outcome, Workers, run_dataset, run_study, write_tables
-from study.cohorts import Anatomy, load_anatomy
+from study.batch import Outcome, Workers, run_dataset, run_study
+from study.datasets import Anatomy, Dataset, PhantomDataset, PlantedDataset, find_dataset
 from study.errors import StudyError
-from study.metrics import TRUTH
-from study.results import FAILED, failed_row, metric_rows, read_metrics
+from study.evaluation.pair import TRUTH
+from study.params import StudyParams
+from study.results.metrics_csv import FAILED, read_metrics
 
 METHODS = ("coarse", "icp")
+
+
+def people(params: StudyParams = SMALL, seed: int = 0, name: str = "phantom") -> Dataset:
+    return find_dataset(name, params, seed)
+
+
 TWO_CTS = replace(SMALL, max_sources=2)
 
 
@@ -32,7 +40,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "first"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(phantom, "ct_volume", cached_ct_volume)
-        run_study("phantom", SMALL, out, methods=METHODS)
+        run_study(people(), out, methods=METHODS)
     return out
 
 
@@ -40,7 +48,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) -> None:
-    run_study("phantom", SMALL, tmp_path, methods=reversed(METHODS), n_jobs=2)
+    run_study(people(), tmp_path, methods=reversed(METHODS), n_jobs=2)
     metrics = read_metrics(first / "metrics.csv")
     assert len(metrics) == 3 * (3 + 3 + 4 * 20)  # methods and truth x (distances, true errors, 4 kinds of 20 waypoints)
     assert set(metrics["status"]) <= {"ok", "not converged"}
@@ -49,7 +57,7 @@ def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) ->
 
 
 def test_one_method_alone_has_the_rows_it_has_among_others(first: Path) -> None:
-    rows, _ = run_dataset("phantom", SMALL, methods=["icp", "icp"])
+    rows, _ = run_dataset(people(), methods=["icp", "icp"])
     among = read_metrics(first / "metrics.csv").query("method == 'icp'")
     alone = pd.DataFrame(rows).query("method == 'icp'").sort_values(["metric", "index"])
     assert len(alone) == len(among)
@@ -66,7 +74,7 @@ def test_a_perfect_registration_is_measured_as_a_method_is(first: Path) -> None:
 
 
 def test_another_seed_gives_other_numbers(first: Path) -> None:
-    rows, _ = run_dataset("phantom", SMALL, methods=["coarse"], seed=1)
+    rows, _ = run_dataset(people(seed=1), methods=["coarse"])
     before = read_metrics(first / "metrics.csv").query("method == 'coarse' and metric == 'hd'")["value"].item()
     after = next(row["value"] for row in rows if row["metric"] == "hd")
     assert after != before
@@ -92,13 +100,14 @@ def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
 
 
 Load = Callable[..., Anatomy]
+ANATOMY: Load = PhantomDataset.anatomy
 
 
 def failing(who: str, error: Exception) -> Load:
-    def load(dataset: str, name: str, *rest: Any) -> Anatomy:
+    def load(self: Dataset, name: str, *rest: Any) -> Anatomy:
         if name == who:
             raise error
-        return load_anatomy(dataset, name, *rest)
+        return ANATOMY(self, name, *rest)
 
     return load
 
@@ -106,13 +115,13 @@ def failing(who: str, error: Exception) -> Load:
 def test_a_subject_that_fails_is_rows_with_the_reason_and_the_rest_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch, "load_anatomy", failing("ct2", StudyError("ct2: expected ribs,\n got a fish")))
-    run_study("phantom", TWO_CTS, tmp_path, methods=METHODS)
+    monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct2", StudyError("ct2: expected ribs,\n got a fish")))
+    run_study(people(TWO_CTS), tmp_path, methods=METHODS)
     metrics = read_metrics(tmp_path / "metrics.csv")
-    failed = metrics[metrics["subject"] == "ct2"]
+    failed = metrics[metrics["source"] == "ct2"]
     assert failed["method"].to_list() == [*METHODS, TRUTH]
     assert set(failed["status"]) == {FAILED + "ct2: expected ribs, got a fish"}
-    assert not metrics[metrics["subject"] == "ct1"]["status"].str.startswith(FAILED).any()
+    assert not metrics[metrics["source"] == "ct1"]["status"].str.startswith(FAILED).any()
     table = pd.read_csv(tmp_path / "hd_table.csv")
     ours = table[table["data"] == "this study"].set_index("method")
     assert ours["n"].to_list() == [1, 1, 1]
@@ -123,9 +132,9 @@ def test_a_subject_that_fails_is_rows_with_the_reason_and_the_rest_goes_on(
 def test_a_patient_that_fails_takes_every_case_with_it_and_that_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch, "load_anatomy", failing("patient", StudyError("patient: expected ribs, got a fish")))
+    monkeypatch.setattr(PhantomDataset, "anatomy", failing("patient", StudyError("patient: expected ribs, got a fish")))
     with pytest.raises(StudyError, match=r"phantom: every case failed: patient: expected ribs, got a fish$"):
-        run_study("phantom", SMALL, tmp_path, methods=METHODS)
+        run_study(people(), tmp_path, methods=METHODS)
     metrics = read_metrics(tmp_path / "metrics.csv")
     assert len(metrics) == 3
     assert metrics["status"].str.endswith("got a fish").all()
@@ -134,35 +143,35 @@ def test_a_patient_that_fails_takes_every_case_with_it_and_that_is_an_error(
 def test_a_method_that_fails_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = batch.register_aligned
 
-    def register(alignment: Any, method: Any, rng: Any) -> Any:
-        if method.name == "icp":
+    def register(alignment: Any, method: Any, *rest: Any) -> Any:
+        if method == METHODS_BY_NAME["icp"]:
             raise StudyError("icp: expected overlap, got none")
-        return whole(alignment, method, rng)
+        return whole(alignment, method, *rest)
 
     monkeypatch.setattr(batch, "register_aligned", register)
-    rows, timings = run_dataset("phantom", SMALL, methods=METHODS)
+    rows, timings = run_dataset(people(), methods=METHODS)
     assert {row["method"] for row in rows if row["status"].startswith(FAILED)} == {"icp"}
     assert sum(row["method"] == "coarse" and row["status"] == "ok" for row in rows) > 80
     assert [row["method"] for row in timings if row["stage"] == "register"] == ["coarse", TRUTH]
 
 
 def test_a_bug_is_no_failed_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "load_anatomy", failing("ct1", ZeroDivisionError("oops")))
+    monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct1", ZeroDivisionError("oops")))
     with pytest.raises(ZeroDivisionError):
-        run_dataset("phantom", SMALL, methods=["coarse"])
+        run_dataset(people(), methods=["coarse"])
 
 
 def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "load_anatomy", failing("ct1", AssertionError("nothing may be read")))
+    monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct1", AssertionError("nothing may be read")))
     with pytest.raises(StudyError, match=r"among coarse, icp, .*got 'ipc'"):
-        run_study("phantom", SMALL, tmp_path / "a", methods=["ipc"])
+        run_study(people(), tmp_path / "a", methods=["ipc"])
     with pytest.raises(StudyError, match="got none"):
-        run_study("phantom", SMALL, tmp_path / "a", methods=[])
+        run_study(people(), tmp_path / "a", methods=[])
     with pytest.raises(StudyError, match="got 'phantom2'"):
-        run_study("phantom2", SMALL, tmp_path / "a", methods=["coarse"])
+        run_study(people(name="phantom2"), tmp_path / "a", methods=["coarse"])
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
-        run_study("phantom", SMALL, tmp_path / "file" / "out", methods=["coarse"])
+        run_study(people(), tmp_path / "file" / "out", methods=["coarse"])
 
 
 # --- the planted deformations ----------------------------------------------------------------------------------------
@@ -170,14 +179,17 @@ def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monke
 
 def test_the_planted_source_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read = []
+    whole = PlantedDataset.anatomy
 
-    def load(dataset: str, name: str, *rest: Any) -> Anatomy:
-        read.append((dataset, name))
-        return replace(load_anatomy("phantom", "ct3", *rest), name=name)  # at 3 mm ct1 planted is refused
+    def load(self: Dataset, name: str, origin: Anatomy | None = None) -> Anatomy:
+        if origin is not None:
+            return whole(self, name, origin)
+        read.append((self.name, name))
+        return replace(people().anatomy("ct3"), name=name)  # at 3 mm ct1 planted is refused
 
-    monkeypatch.setattr(batch, "load_anatomy", load)
-    monkeypatch.setattr(batch, "fetch_subject", lambda *_: None)
-    rows, timings = run_dataset("planted", replace(SMALL, max_targets=3), methods=["coarse"])
+    monkeypatch.setattr(PlantedDataset, "anatomy", load)
+    monkeypatch.setattr(PlantedDataset, "fetch", lambda *_: None)
+    rows, timings = run_dataset(people(replace(SMALL, max_targets=3), name="planted"), methods=["coarse"])
     assert read == [("planted", "lidc-0001")]
     assert {row["target"] for row in rows} == {"planted1", "planted2", "planted3"}
     done = [row for row in rows if row["target"] == "planted1"]
@@ -212,26 +224,3 @@ def test_progress_says_which_of_how_many_and_the_time_left(capsys: pytest.Captur
     shown = capsys.readouterr().err
     assert "phantom: registrations: 2 of 2" in shown
     assert "left" in shown
-
-
-def rows_of(cases: list[tuple[str, str]]) -> pd.DataFrame:
-    rows = [row for source, target in cases for row in metric_rows("d", source, target, "icp", 0, {"hd": 9.0})]
-    return pd.DataFrame(rows)
-
-
-def test_one_patient_gives_one_table_and_more_give_one_each_and_all_pairs(tmp_path: Path) -> None:
-    write_tables(rows_of([("a", "b"), ("b", "a"), ("c", "a")]), tmp_path)
-    assert {path.stem for path in tmp_path.glob("*.md")} == {"hd_table_a", "hd_table_b", "hd_all_pairs"}
-    write_tables(rows_of([("a", "p"), ("b", "p")]), tmp_path)  # the former run's are gone
-    assert {path.stem for path in tmp_path.glob("*.md")} == {"hd_table"}
-
-
-def test_one_ct_with_several_patients_has_them_as_columns(tmp_path: Path) -> None:
-    write_tables(rows_of([("a", "p1"), ("a", "p2")]), tmp_path)
-    assert [path.stem for path in tmp_path.glob("*.md")] == ["hd_table"]
-    assert {"p1", "p2"} <= set(pd.read_csv(tmp_path / "hd_table.csv").columns)
-
-
-def test_a_table_of_failures_only_can_be_written(tmp_path: Path) -> None:
-    write_tables(pd.DataFrame([failed_row("d", s, "p", "icp", 0, "no sternum") for s in "ab"]), tmp_path)
-    assert "2 failed" in (tmp_path / "hd_table.md").read_text(encoding="utf-8")

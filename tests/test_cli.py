@@ -26,11 +26,12 @@ from scipy.spatial import KDTree
 from study import params as study_params
 from study import phantom
 from study.cli import main
-from study.ct import parts_from_labels
-from study.data.clouds import read_ply, write_ply
+from study.ct.parts import parts_from_labels
+from study.files.atomic import sha256_of
+from study.files.clouds import read_ply, write_ply
 from study.methods import METHODS
 from study.params import PHANTOM_SEED
-from study.results import metric_rows, read_metrics, sha256_of, write_metrics
+from study.results.metrics_csv import Case, metric_rows, read_metrics, write_metrics
 from study.types import PointCloud, RigidTransform
 
 Capture = pytest.CaptureFixture[str]
@@ -85,7 +86,7 @@ def refused(capsys: Capture, *arguments: str | Path) -> str:
 
 @pytest.mark.parametrize(
     "words",
-    [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"],
+    [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"], ["datasets"],
      ["data", "list"], ["data", "fetch"], ["data", "verify"]],
     ids=" ".join,
 )  # fmt: skip
@@ -105,7 +106,7 @@ def test_study_alone_prints_the_commands(capsys: Capture) -> None:
 
 def test_the_module_exits_with_the_code_and_no_traceback() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "study.cli", "run", "--profile", "fast"],
+        [sys.executable, "-m", "study", "run", "--profile", "fast"],
         capture_output=True,
         encoding="utf-8",
         check=False,
@@ -278,7 +279,7 @@ def test_a_manifest_of_ones_own_runs_compares_and_reports(tmp_path: Path, capsys
     assert "Hausdorff distance, mine" in out
     assert "mine: registrations: 2 of 2" in err
     metrics = read_metrics(tmp_path / "runs" / "mine" / "metrics.csv")
-    assert set(zip(metrics["subject"], metrics["target"], strict=True)) == {("ct2", "ct1")}
+    assert set(zip(metrics["source"], metrics["target"], strict=True)) == {("ct2", "ct1")}
     assert set(metrics[metrics["method"] == "coarse"]["status"]) == {"ok"}
     assert not metrics["metric"].str.startswith("true").any()  # between two people no truth is known
     inputs = json.loads((tmp_path / "runs" / "mine" / "provenance.json").read_text(encoding="utf-8"))["inputs_sha256"]
@@ -303,7 +304,7 @@ def test_a_manifest_of_ones_own_runs_compares_and_reports(tmp_path: Path, capsys
 
 
 def metrics_file(folder: Path, hd: float = 10.0, method: str = "icp") -> Path:
-    write_metrics(metric_rows("d", "a", "b", method, 0, {"hd": hd}), folder / "metrics.csv")
+    write_metrics(metric_rows(Case("d", "a", "b", method, 0), {"hd": hd}), folder / "metrics.csv")
     return folder
 
 
@@ -329,6 +330,20 @@ def test_compare_agrees_differs_and_cannot(tmp_path: Path, capsys: Capture) -> N
     rows = (tmp_path / "no_rows" / "metrics.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "no_rows" / "metrics.csv").write_text(rows[0] + "\n")
     assert "at least one row" in refused(capsys, "compare", reference, "no_rows")
+
+
+def test_only_the_whole_study_goes_where_the_reference_is_made_from(tmp_path: Path, capsys: Capture) -> None:
+    words = ["run", "--profile", "quick", "--methods", "coarse"]
+    assert main(words) == 0
+    assert "metrics, tables and provenance: results/trials/phantom-quick-seed0-coarse\n" in capsys.readouterr().out
+    assert not (tmp_path / "results" / "runs").exists()
+
+
+def test_datasets_are_listed_by_the_library(capsys: Capture) -> None:
+    assert main(["datasets", "--reported"]) == 0
+    assert capsys.readouterr().out.splitlines() == ["phantom", "planted", "open"]
+    assert main(["datasets"]) == 0
+    assert {"ribseg", "totalsegmentator"} < set(capsys.readouterr().out.splitlines())
 
 
 def test_report_needs_runs(tmp_path: Path, capsys: Capture) -> None:

@@ -2,33 +2,64 @@
 
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from oracles import toy_chest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import study
 from study import METHODS, phantom, register_pair
-from study.coarse import align
+from study.alignment.chest import align
 from study.errors import StudyError
-from study.pipeline import find_method, named_rng, register_aligned
+from study.files.plus import read_plus
+from study.methods.coarse_only import CoarseOnly
+from study.pipeline import find_method, register_aligned, run_method
+from study.registration import Registration, transfer
+from study.seeds import named_rng
 from study.types import PointCloud, RigidTransform
+from study.ultrasound.cloud import sweep_cloud
 
 
 def test_the_front_door_holds_what_others_rely_on():
     assert register_pair is study.pipeline.register_pair
     assert METHODS is study.methods.METHODS
     assert study.StudyError is StudyError
+    assert (study.PointCloud, study.Registration) == (PointCloud, Registration)
+    assert (study.transfer, study.sweep_cloud, study.read_plus) == (transfer, sweep_cloud, read_plus)
+    assert study.__version__
+    assert {getattr(study, name) is not None for name in study.__all__} == {True}
     assert set(study.__all__) <= set(dir(study))
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = study.nonsense
 
 
+SLOW = ("open3d", "trimesh", "pycpd")
+
+
+def loaded(imports: str, *names: str) -> list[str]:
+    """Which of ``names`` a fresh interpreter has after ``imports``."""
+    code = f"import sys, {imports}; print(*[name for name in {names!r} if name in sys.modules])"
+    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+
+
 def test_importing_the_package_imports_no_method():
-    code = "import sys, study; sys.exit('open3d' in sys.modules or 'sklearn' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert loaded("study", *SLOW, "sklearn", "numpy") == []
 
 
-def test_generators_come_from_names():
+def test_the_names_of_the_methods_cost_no_slow_library():
+    assert loaded("study.methods", *SLOW, "study.methods") == ["study.methods"]
+
+
+def test_what_runs_methods_has_their_libraries_before_it_limits_the_threads():
+    assert loaded("study.pipeline", *SLOW) == list(SLOW)
+
+
+def test_generators_come_from_names_and_not_from_order():
     draws = {
         (seed, name): named_rng(seed, name).integers(1 << 60) for seed in (0, 1) for name in ("a/us/icp", "b/us/icp")
     }
@@ -90,3 +121,66 @@ def test_the_result_is_expressed_from_the_ct_clouds_own_frame(ct_clouds, us_clou
     result = register_aligned(alignment, METHODS["icp"], np.random.default_rng(0))
     assert np.array_equal(result.source, source.points)
     assert result.warped == pytest.approx(result.T_us_ct.apply(source.points), abs=1e-9)
+    assert result.method == "icp"
+    assert register_aligned(alignment, METHODS["icp"], np.random.default_rng(0), "mine").method == "mine"
+
+
+@dataclass(frozen=True)
+class Toy:
+    """Does what ``then`` does to the answer of the coarse alignment."""
+
+    name: ClassVar[str] = "toy"
+
+    then: Callable[[Registration], Registration]
+
+    def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
+        return self.then(CoarseOnly().register(source, target, rng))
+
+
+def run_toy(then: Callable[[Registration], Registration], name: str | None = None) -> Registration:
+    cloud = toy_chest(np.random.default_rng(0), 500)
+    return run_method(Toy(then), cloud, cloud, np.random.default_rng(0), name)
+
+
+def test_a_run_is_timed_and_named():
+    def slow(result: Registration) -> Registration:
+        time.sleep(0.05)
+        return replace(result, seconds=99.0, method="wrong", warnings=("thin",))
+
+    result = run_toy(slow)
+    assert 0.05 <= result.seconds < 5
+    assert (result.method, result.warnings) == ("toy", ("thin",))
+    assert run_toy(slow, "mine").method == "mine"
+
+
+def test_a_method_runs_on_one_thread():
+    seen = []
+
+    def look(result: Registration) -> Registration:
+        seen.extend((pool["user_api"], pool["num_threads"]) for pool in threadpool_info())
+        return result
+
+    with threadpool_limits(limits=2):
+        run_toy(look)
+        assert max(pool["num_threads"] for pool in threadpool_info()) == 2  # it is given back
+    assert {"blas", "openmp"} <= {kind for kind, _ in seen}
+    assert {threads for _, threads in seen} == {1}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda p: p[:-1], r"toy: expected one warped point per point of 'toy' \(500, 3\), got \(499, 3\); a method"),
+        (lambda p: p[:, :2], r"toy: expected one warped point .* got \(500, 2\)"),
+        (lambda p: np.where(np.arange(500)[:, None] < 2, np.nan, p), "toy: expected finite points .* got 2 rows with"),
+        (lambda p: np.where(np.arange(500)[:, None] < 1, np.inf, p), "toy: expected finite points .* got 1 rows with"),
+    ],
+)
+def test_an_answer_that_is_none_is_refused(spoil, message):
+    with pytest.raises(StudyError, match=message):
+        run_toy(lambda result: replace(result, warped=spoil(result.warped)))
+
+
+def test_an_answer_for_other_points_is_refused():
+    with pytest.raises(StudyError, match="toy: expected one warped point per point of"):
+        run_toy(lambda result: replace(result, source=result.source[1:], warped=result.warped[1:]))

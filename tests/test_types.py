@@ -2,20 +2,9 @@
 
 import numpy as np
 import pytest
-from oracles_som import hops_literal
 
 from study.errors import StudyError
-from study.types import (
-    CARTILAGES,
-    Mesh,
-    Part,
-    PointCloud,
-    RigidTransform,
-    SkeletonGraph,
-    Volume,
-    Waypoints,
-    as_points,
-)
+from study.types import CARTILAGES, Mesh, Part, PointCloud, RigidTransform, Volume, Waypoints, as_points
 
 BOX = np.random.default_rng(0).uniform(-100, 100, (200, 3))
 
@@ -128,12 +117,6 @@ def test_random_rotations_are_proper_and_spread_over_all_of_so3():
     assert np.abs(rotations.mean(axis=0)).max() < 0.12
 
 
-def test_a_chest_frame_is_right_handed(chest):
-    assert np.cross(chest.left, chest.up) == pytest.approx(chest.front)
-    chest_point = np.array([[10.0, 20.0, 30.0]])  # left, up, front
-    assert chest.T_cloud_chest.apply(chest_point)[0] == pytest.approx([1 - 10, 2 + 30, 3 + 20])
-
-
 def test_a_volume_maps_indices_to_millimetres_and_back():
     pose = RigidTransform.random(np.random.default_rng(3))
     volume = Volume(np.arange(4 * 5 * 6).reshape(4, 5, 6), np.array([0.5, 1.0, 2.0]), pose)
@@ -147,17 +130,6 @@ def test_a_volume_maps_indices_to_millimetres_and_back():
     assert cut.to_mm([[0, 0, 0]]) == pytest.approx(volume.to_mm([[1, 2, 3]]), abs=1e-9)
     with pytest.raises(StudyError, match="expected a box of at least 2 voxels a side, got"):
         volume.crop([3, 0, 0], [9, 9, 9])
-
-
-def test_hops_are_those_of_a_breadth_first_search():
-    rng = np.random.default_rng(5)
-    edges = rng.integers(30, size=(45, 2))
-    graph = SkeletonGraph(rng.normal(size=(30, 3)), edges, np.zeros(30, dtype=np.int64))
-    for directed in (True, False):
-        hops = graph.hops(directed=directed)
-        assert np.array_equal(hops, hops_literal(30, edges, directed=directed))
-        assert (hops == 30).any()  # unreachable pairs are there and say so
-    assert np.array_equal(graph.hops(directed=False), graph.hops(directed=False).T)
 
 
 def test_waypoints_have_one_label_each():

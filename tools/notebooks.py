@@ -20,6 +20,8 @@ import nbformat
 import papermill
 from joblib import Parallel, delayed
 
+from study.datasets import reported
+
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
 MAX_BYTES = 1_000_000
@@ -103,7 +105,7 @@ def main() -> int:
             (source, f"{source.stem}-{dataset}", {"profile": chosen.profile, "dataset": dataset})
             for source in todo
             if source.stem.endswith("_study")
-            for dataset in ("open", "planted")
+            for dataset in reported()[1:]  # the first is the notebook's own
         ]
     folder = chosen.out if chosen.verb == "run" else NOTEBOOKS
     done = 0

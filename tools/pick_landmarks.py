@@ -20,10 +20,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from study.cartilage_growth import parts_from_landmarks
-from study.chest_wall import WallImage, anterior_wall_image
-from study.data.landmarks import Landmarks, read_landmarks
-from study.data.volumes import read_volume
+from study.ct.growth import parts_from_landmarks
+from study.ct.landmarks import Landmarks
+from study.ct.wall import WallImage, anterior_wall_image
+from study.files.landmarks import read_landmarks
+from study.files.volumes import read_volume
 from study.types import Part, Volume
 
 

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import pandas as pd
 
+from study.datasets import reported
+from study.evaluation.pair import TRUTH
+from study.evaluation.statistics import population_sd
+from study.files.atomic import write_text
 from study.methods import METHODS
-from study.metrics import TRUTH, population_sd
-from study.results import paper_hd_table, paper_waypoints, read_metrics, write_text
+from study.results import REFERENCE, Run, paper_hd_table, paper_waypoints
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 BEGIN, END = "<!-- results:begin -->\n", "<!-- results:end -->"
-DATASETS = ("phantom", "planted", "open")
 MEASURES = {
     "hd": "Hausdorff distance (Eq. 5), over pairs",
     "waypoint_error": "Waypoint error by the paper's protocol, over waypoints",
@@ -38,7 +40,7 @@ def one_table(measure: str, runs: dict[str, pd.DataFrame]) -> str:
         if not numbers:
             continue
         best = min((method for method in numbers if method != TRUTH), key=lambda method: numbers[method][0])
-        n_pairs = len(chosen.drop_duplicates(["subject", "target"]))
+        n_pairs = len(chosen.drop_duplicates(["source", "target"]))
         columns[f"{name} (n = {n_pairs} pairs)"] = {
             method: f"**{mean:.2f} ± {sd:.2f}**" if method == best else f"{mean:.2f} ± {sd:.2f}"
             for method, (mean, sd) in numbers.items()
@@ -88,7 +90,7 @@ def reading(runs: dict[str, pd.DataFrame]) -> str:
 
 def section() -> str:
     """The part of the README between the markers."""
-    runs = {name: read_metrics(ROOT / "results" / "reference" / name / "metrics.csv") for name in DATASETS}
+    runs = {name: Run(REFERENCE / name).metrics for name in reported()}
     note = (
         "Mean ± population SD, mm; bold: the smallest of a column. `phantom`: synthetic CTs to one synthetic patient; "
         "`planted`: a real CT to itself under known deformations; `open`: ordered pairs of real people. Every patient "

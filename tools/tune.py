@@ -21,19 +21,23 @@ from typing import Any
 import pandas as pd
 
 from study import phantom
-from study.coarse import Alignment, align
-from study.cohorts import make_patient, phantom_anatomy
+from study.alignment.chest import Alignment, align
+from study.data.manifest import load_manifest
+from study.datasets.people import make_patient
+from study.datasets.phantoms import PhantomDataset
 from study.errors import StudyError
+from study.evaluation.distances import hausdorff_mm, point_errors_mm
 from study.methods.cpd import Cpd
 from study.methods.icp import Icp
-from study.methods.nonrigid_icp import NonrigidIcp, Step
+from study.methods.nonrigid_icp import NonrigidIcp, Stage
 from study.methods.skeleton_graph import SkeletonGraphMethod
 from study.methods.visible_surface import VisibleSurface
-from study.metrics import hausdorff_mm, point_errors_mm
 from study.params import find_profile
-from study.pipeline import named_rng, register_aligned
-from study.som import SomParams
-from study.types import Floats, Method
+from study.pipeline import register_aligned
+from study.registration import Method
+from study.seeds import named_rng
+from study.skeleton.som import SomParams
+from study.types import Floats
 
 # Source subject and cohort seed; the target is its "patient".
 PAIRS = (("ct1", 101), ("ct2", 102), ("ct3", 103), ("ct4", 104), ("ct5", 105), ("ct1", 106))
@@ -54,19 +58,20 @@ class Case:
 
 def development_case(name: str, seed: int) -> Case:
     params = find_profile("full")
-    atlas, patient = (phantom_anatomy(one, seed, params) for one in (name, "patient"))
+    people = PhantomDataset("phantom", params, 0, load_manifest(), cohort_seed=seed)
+    atlas, patient = people.anatomy(name), people.anatomy("patient")
     seen = make_patient(patient, params, seed)
     drawn = [phantom.draw_subject(one, seed) for one in (name, "patient")]
     there = [seen.T_us_ras.apply(phantom.truth_map(*drawn, p)) for p in (atlas.cloud.points, atlas.waypoints.points)]
     return Case(f"{name}@{seed}", align(atlas.cloud, seen.cloud), there[0], atlas.waypoints.points, there[1])
 
 
-def scaled_steps(factor: float) -> tuple[Step, ...]:
+def scaled_steps(factor: float) -> tuple[Stage, ...]:
     """The library's own steps, stiffer by ``factor``."""
     return tuple((round(ws * factor, 6), wl, wn, n) for ws, wl, wn, n in NonrigidIcp().steps)
 
 
-def falling_steps(stiffest: float) -> tuple[Step, ...]:
+def falling_steps(stiffest: float) -> tuple[Stage, ...]:
     """Amberg's order, stiff first."""
     return tuple((round(stiffest / 3**k, 6), 0.0, 0.5 if k < 3 else 0.0, 10) for k in range(4))
 

@@ -3,12 +3,31 @@
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 # Found on first use: importing the methods costs seconds, which `study data list` need not pay.
-_HOMES = {"METHODS": "study.methods", "register_pair": "study.pipeline", "StudyError": "study.errors"}
+_HOMES = {
+    "METHODS": "study.methods",
+    "PointCloud": "study.types",
+    "Registration": "study.registration",
+    "StudyError": "study.errors",
+    "read_plus": "study.files.plus",
+    "register_pair": "study.pipeline",
+    "sweep_cloud": "study.ultrasound.cloud",
+    "transfer": "study.registration",
+}
 
-__all__ = ["METHODS", "StudyError", "__version__", "register_pair"]
+__all__ = [
+    "METHODS",
+    "PointCloud",
+    "Registration",
+    "StudyError",
+    "__version__",
+    "read_plus",
+    "register_pair",
+    "sweep_cloud",
+    "transfer",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,94 +1,41 @@
-"""A whole dataset: every pair, every method, in any number of worker processes."""
+"""A whole data set: every pair, every method, in any number of worker processes."""
 
 from __future__ import annotations
 
 import hashlib
+import os
 import sys
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-import pandas as pd
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from study.coarse import Alignment, Chest, find_chest
-from study.cohorts import (
-    Anatomy,
-    Patient,
-    fetch_subject,
-    files_of_subject,
-    has_truth,
-    load_anatomy,
-    make_patient,
-    origin_of,
-    pairs,
-    plant,
-    truth_map,
-)
-from study.data.manifest import Manifest, load_manifest
+from study.alignment.chest import Chest, find_chest
+from study.datasets import Anatomy, Dataset, Patient, find_dataset
 from study.errors import StudyError
+from study.evaluation.metrics import judge
+from study.evaluation.pair import TRUTH, Pair, perfect
+from study.files.atomic import sha256_of
 from study.methods import METHODS
-from study.metrics import TRUTH, hausdorff_mm, hd95_mm, mean_surface_distance_mm, point_errors_mm, waypoint_errors_mm
-from study.params import StudyParams
-from study.pipeline import find_method, named_rng, register_aligned
-from study.results import (
-    FAILED,
-    TIMING_COLUMNS,
-    Row,
-    failed_row,
-    metric_rows,
-    provenance,
-    read_metrics,
-    sha256_of,
-    why_stale,
-    write_hd_table,
-    write_json,
-    write_metrics,
-    write_timings,
-)
-from study.types import Floats, Registration
-from study.waypoints import intercostal_waypoints
+from study.params import find_profile
+from study.pipeline import find_method, register_aligned
+from study.results.metrics_csv import TIMING_COLUMNS, Case, Row, failed_row, metric_rows
+from study.results.run import Run, run_folder, write_run
+from study.seeds import named_rng
 
 K = TypeVar("K", bound=Hashable)
-Step = tuple[Any, ...]  # a function and its arguments
-
-
-@dataclass(frozen=True)
-class Case:
-    """One CT, one patient, one method."""
-
-    source: str
-    target: str
-    method: str
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A CT and a patient, coarsely aligned, with what is known of the answer; the same for every method.
-
-    Attributes:
-        alignment: the two clouds and the motion that overlays their sternums.
-        waypoints_ct, waypoints_us: (k, 3) mm, each in its own cloud's frame.
-        true_points, true_waypoints: where the CT's points and waypoints truly lie, (n, 3) and (k, 3) mm in the US
-            frame; None between two real people.
-    """
-
-    alignment: Alignment
-    waypoints_ct: Floats
-    waypoints_us: Floats
-    true_points: Floats | None
-    true_waypoints: Floats | None
+Call = tuple[Any, ...]  # a function and its arguments
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one step gave, a value or why it failed, and how long it took."""
+    """What one call gave, a value or why it failed, and how long it took."""
 
     value: Any = None
     error: StudyError | None = None
@@ -98,7 +45,7 @@ class Outcome:
         """The value.
 
         Raises:
-            StudyError: the step, or one that it builds on, failed.
+            StudyError: the call, or one that it builds on, failed.
         """
         if self.error is not None:
             raise self.error
@@ -107,31 +54,31 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Workers:
-    """Processes that run independent steps, and a bar that shows how far they are."""
+    """Processes that run independent calls, and a bar that shows how far they are."""
 
     n_jobs: int
     show_progress: bool
 
-    def run(self, label: str, steps: Mapping[K, Step]) -> dict[K, Outcome]:
+    def run(self, label: str, calls: Mapping[K, Call]) -> dict[K, Outcome]:
         """Run every ``(function, *arguments)``; an argument that is an earlier outcome stands for its value."""
         if self.n_jobs == 1:
-            outcomes: Iterator[Outcome] = (_attempt(*step) for step in steps.values())
+            outcomes: Iterator[Outcome] = (_attempt(*call) for call in calls.values())
         else:
-            calls = (delayed(_attempt)(*step) for step in steps.values())
-            outcomes = Parallel(n_jobs=self.n_jobs, return_as="generator")(calls)
+            todo = (delayed(_attempt)(*call) for call in calls.values())
+            outcomes = Parallel(n_jobs=self.n_jobs, return_as="generator")(todo)
         bar = tqdm(
             outcomes,
-            total=len(steps),
+            total=len(calls),
             desc=label,
             bar_format="{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed} so far, about {remaining} left",
             mininterval=0.2 if sys.stderr.isatty() else 15,  # a log file needs a line now and then, not a moving bar
-            disable=not (self.show_progress and steps),
+            disable=not (self.show_progress and calls),
         )
-        return dict(zip(steps, bar, strict=True))
+        return dict(zip(calls, bar, strict=True))
 
 
 def _attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:
-    """Run one step; a failure, its own or an argument's, is kept instead of raised."""
+    """Make one call; a failure, its own or an argument's, is kept instead of raised."""
     start = time.perf_counter()
     value, failure = None, None
     with threadpool_limits(1):  # sums then have one order, whatever the number of workers
@@ -143,91 +90,68 @@ def _attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:
 
 
 def run_dataset(
-    dataset: str,
-    params: StudyParams,
-    *,
-    methods: Iterable[str] | None = None,
-    seed: int = 0,
-    n_jobs: int = 1,
-    manifest: Manifest | None = None,
-    show_progress: bool = False,
+    dataset: Dataset, *, methods: Iterable[str] | None = None, n_jobs: int = 1, show_progress: bool = False
 ) -> tuple[list[Row], list[Row]]:
-    """All cases of a dataset.
+    """All cases of a data set.
 
     Args:
-        dataset: a cohort of the manifest, or ``planted``.
-        params: the profile.
+        dataset: who is registered to whom, how finely, with which seed.
         methods: names in ``METHODS``; all when None.
-        seed: of samples, sweeps and methods; combined with names, never with order.
         n_jobs: worker processes.
-        manifest: the repository's when None.
         show_progress: bars on standard error.
 
     Returns:
         rows of ``metrics.csv`` and of ``timings.csv``.
 
     Raises:
-        StudyError: an unknown dataset or method; a subject or pair that fails is rows instead.
+        StudyError: nobody to pair, or an unknown method; a person or pair that fails is rows instead.
     """
-    chosen = _chosen(methods)
-    manifest = manifest or load_manifest()
-    todo = pairs(dataset, params, manifest)
-    sources, targets = (list(dict.fromkeys(names)) for names in zip(*todo, strict=True))
-    origins = {name: origin_of(dataset, name) for name in dict.fromkeys([*sources, *targets])}
-    with_ct = list(dict.fromkeys(origin or name for name, origin in origins.items()))
     workers = Workers(n_jobs, show_progress)
-
-    # One process fetches, with bars of its own; the workers then only read.
-    files = {name: _attempt(fetch_subject, dataset, name, manifest, show_progress) for name in with_ct}
-    anatomies = workers.run(
-        f"{dataset}: anatomies", {n: (_load, files[n], dataset, n, params, seed, manifest) for n in with_ct}
-    )
-    anatomies |= workers.run(
-        f"{dataset}: planted patients",
-        {name: (plant, anatomies[origin], name) for name, origin in origins.items() if origin},
-    )
+    judged = [*chosen_methods(methods), *([TRUTH] if dataset.has_truth else [])]
+    anatomies = _anatomies(dataset, workers)
     patients = workers.run(
-        f"{dataset}: virtual sweeps", {name: (make_patient, anatomies[name], params, seed) for name in targets}
+        f"{dataset.name}: virtual sweeps",
+        {name: (dataset.patient, name, anatomies[name]) for name in dict.fromkeys(t for _, t in dataset.pairs())},
     )
     chests = workers.run(
-        f"{dataset}: coarse alignment",
-        {("ct", name): (_chest, anatomies[name]) for name in sources}
-        | {("us", name): (_chest, patients[name]) for name in targets},
+        f"{dataset.name}: coarse alignment",
+        {("ct", name): (_chest, anatomies[name]) for name in dict.fromkeys(s for s, _ in dataset.pairs())}
+        | {("us", name): (_chest, patient) for name, patient in patients.items()},
     )
-    matched = workers.run(
-        f"{dataset}: pairs",
-        {(s, t): (_pair, dataset, anatomies[s], patients[t], chests["ct", s], chests["us", t]) for s, t in todo},
-    )
-    judged = [*chosen, TRUTH] if has_truth(dataset) else chosen
-    cases = workers.run(
-        f"{dataset}: registrations",
+    pairs = workers.run(
+        f"{dataset.name}: pairs",
         {
-            case: (run_case, dataset, case, matched[case.source, case.target], seed, params.radius_mm)
-            for case in (Case(source, target, method) for source, target in todo for method in judged)
+            (s, t): (_pair, dataset, anatomies[s], patients[t], chests["ct", s], chests["us", t])
+            for s, t in dataset.pairs()
         },
     )
-
-    rows: list[Row] = []
-    for case, outcome in cases.items():
-        if outcome.error is None:
-            rows += outcome.value
-        else:
-            who = (dataset, case.source, case.target, case.method, seed)
-            rows.append(failed_row(*who, str(outcome.error)))
+    cases = workers.run(
+        f"{dataset.name}: registrations",
+        {
+            Case(dataset.name, *names, method, dataset.seed): (
+                run_case,
+                method,
+                pair,
+                dataset.seed,
+                dataset.params.radius_mm,
+            )
+            for names, pair in pairs.items()
+            for method in judged
+        },
+    )
     steps = {(name, "", "", "anatomy"): outcome for name, outcome in anatomies.items()}
     steps |= {(name, "", "", "sweep"): outcome for name, outcome in patients.items()}
     steps |= {(name, "", "", f"coarse {side}"): outcome for (side, name), outcome in chests.items()}
     steps |= {(case.source, case.target, case.method, "register"): outcome for case, outcome in cases.items()}
-    timings = [
-        dict(zip(TIMING_COLUMNS, (dataset, *who, seed, stage, round(outcome.seconds, 3)), strict=True))
-        for (*who, stage), outcome in steps.items()
-        if outcome.error is None
-    ]
-    return rows, timings
+    return _metric_rows(cases), _timing_rows(dataset, steps)
 
 
-def _chosen(methods: Iterable[str] | None) -> list[str]:
-    """Names of the methods to run, each once and known."""
+def chosen_methods(methods: Iterable[str] | None) -> list[str]:
+    """Names of the methods to run, each once and known; all when None.
+
+    Raises:
+        StudyError: none, or an unknown one.
+    """
     chosen = list(METHODS) if methods is None else list(dict.fromkeys(methods))
     if not chosen:
         raise StudyError(f"expected a method among {', '.join(METHODS)}, got none")
@@ -236,159 +160,129 @@ def _chosen(methods: Iterable[str] | None) -> list[str]:
     return chosen
 
 
-def _load(_fetched: None, dataset: str, name: str, params: StudyParams, seed: int, manifest: Manifest) -> Anatomy:
-    """An anatomy without its images, which are large and of no use after this; its files are here."""
-    return replace(load_anatomy(dataset, name, params, seed, manifest), image=None, mask=None)
+def _anatomies(dataset: Dataset, workers: Workers) -> dict[str, Outcome]:
+    """Everybody's anatomy: first those with a CT of their own, then those that are known deformations of one."""
+    origins = {name: dataset.origin(name) for name in dataset.names()}
+    own = list(dict.fromkeys(origin or name for name, origin in origins.items()))
+    # One process fetches, with bars of its own; the workers then only read.
+    fetched = {name: _attempt(dataset.fetch, name, workers.show_progress) for name in own}
+    anatomies = workers.run(f"{dataset.name}: anatomies", {name: (_load, fetched[name], dataset, name) for name in own})
+    return anatomies | workers.run(
+        f"{dataset.name}: planted patients",
+        {name: (dataset.anatomy, name, anatomies[origin]) for name, origin in origins.items() if origin},
+    )
+
+
+def _load(_fetched: None, dataset: Dataset, name: str) -> Anatomy:
+    """An anatomy whose files are here, without its images."""
+    return dataset.anatomy(name).without_images()
 
 
 def _chest(person: Anatomy | Patient) -> Chest:
     return find_chest(person.cloud)
 
 
-def _pair(dataset: str, anatomy: Anatomy, patient: Patient, chest_ct: Chest, chest_us: Chest) -> Pair:
-    truth = truth_map(dataset, anatomy, patient.anatomy.name)
-    return Pair(
-        Alignment(chest_ct, chest_us),
-        anatomy.waypoints.points,
-        intercostal_waypoints(patient.labelled).points,
-        None if truth is None else patient.T_us_ras.apply(truth(anatomy.cloud.points)),
-        None if truth is None else patient.T_us_ras.apply(truth(anatomy.waypoints.points)),
-    )
+def _pair(dataset: Dataset, source: Anatomy, patient: Patient, ct: Chest, us: Chest) -> Pair:
+    return dataset.pair(source, patient, (ct, us))
 
 
-def run_case(dataset: str, case: Case, pair: Pair, seed: int, radius_mm: float) -> list[Row]:
-    """The rows of one case; of method ``TRUTH``, what a perfect registration scores.
+def run_case(method: str, pair: Pair, seed: int, radius_mm: float) -> tuple[dict[str, Any], bool]:
+    """Register and judge one pair; of method ``TRUTH``, what a perfect registration scores.
+
+    Returns:
+        values by metric, and whether the method converged.
 
     Raises:
         StudyError: the method or the path transfer failed.
     """
-    if case.method == TRUTH:
-        result = _perfect(pair)
+    if method == TRUTH:
+        result = perfect(pair)
     else:
-        rng = named_rng(seed, f"{case.source}/{case.target}/{case.method}")
-        result = register_aligned(pair.alignment, find_method(case.method), rng)
-    values = evaluate(pair, result, radius_mm)
-    return metric_rows(dataset, case.source, case.target, case.method, seed, values, converged=result.converged)
+        result = register_aligned(pair.alignment, find_method(method), named_rng(seed, f"{pair.name}/{method}"))
+    return judge(pair, result, radius_mm), result.converged
 
 
-def _perfect(pair: Pair) -> Registration:
-    assert pair.true_points is not None
-    source = pair.alignment.source.cloud.points
-    return Registration(source, pair.true_points, pair.alignment.T_us_ct, True, 0, "the truth itself", method=TRUTH)
+def _metric_rows(cases: Mapping[Case, Outcome]) -> list[Row]:
+    rows: list[Row] = []
+    for case, outcome in cases.items():
+        if outcome.error is None:
+            values, converged = outcome.value
+            rows += metric_rows(case, values, converged=converged)
+        else:
+            rows.append(failed_row(case, str(outcome.error)))
+    return rows
 
 
-def evaluate(pair: Pair, result: Registration, radius_mm: float = 20.0) -> dict[str, Any]:
-    """The metrics of one registration (sec. IV); true errors only where the truth is known."""
-    target = pair.alignment.target
-    normal = target.T_cloud_chest.rotation[:, 2]
-    moved = result.transfer(pair.waypoints_ct, radius_mm)
-    values: dict[str, Any] = {
-        "hd": hausdorff_mm(result.warped, target.cloud.points),
-        "hd95": hd95_mm(result.warped, target.cloud.points),
-        "msd": mean_surface_distance_mm(result.warped, target.cloud.points),
-        "waypoint_error": waypoint_errors_mm(moved, pair.waypoints_us),
-        "waypoint_error_inplane": waypoint_errors_mm(moved, pair.waypoints_us, normal),
-    }
-    if pair.true_points is not None and pair.true_waypoints is not None:
-        errors = point_errors_mm(result.warped, pair.true_points)
-        values |= {
-            "true_error_mean": errors.mean(),
-            "true_error_p95": np.percentile(errors, 95),
-            "true_error_max": errors.max(),
-            "true_waypoint_error": waypoint_errors_mm(moved, pair.true_waypoints),
-            "true_waypoint_error_inplane": waypoint_errors_mm(moved, pair.true_waypoints, normal),
-        }
-    return values
+def _timing_rows(dataset: Dataset, steps: Mapping[tuple[str, str, str, str], Outcome]) -> list[Row]:
+    return [
+        dict(zip(TIMING_COLUMNS, (dataset.name, *who, dataset.seed, stage, round(outcome.seconds, 3)), strict=True))
+        for (*who, stage), outcome in steps.items()
+        if outcome.error is None
+    ]
 
 
 def run_study(
-    dataset: str,
-    params: StudyParams,
+    dataset: Dataset,
     out: Path,
     *,
     methods: Iterable[str] | None = None,
-    seed: int = 0,
     n_jobs: int = 1,
-    manifest: Manifest | None = None,
     show_progress: bool = False,
-) -> None:
-    """Run a dataset and write ``metrics.csv``, ``timings.csv``, ``provenance.json`` and the tables into ``out``.
+) -> Run:
+    """Run a data set and write ``metrics.csv``, ``timings.csv``, ``provenance.json`` and the tables into ``out``.
+
+    Args:
+        dataset: see `run_dataset`.
+        out: folder of results.
+        methods: names in ``METHODS``; all when None.
+        n_jobs: worker processes.
+        show_progress: bars on standard error.
 
     Raises:
-        StudyError: an unknown dataset or method, or no case that succeeded; the rows with the reasons are written.
+        StudyError: as `run_dataset`, or no case that succeeded; the rows with the reasons are written.
     """
-    chosen = _chosen(methods)
-    manifest = manifest or load_manifest()
-    pairs(dataset, params, manifest)  # an unknown dataset leaves no folder
+    chosen = chosen_methods(methods)
+    dataset.pairs()  # nobody to pair leaves no folder
     out.mkdir(parents=True, exist_ok=True)  # a folder that can't be written is better known now than after the run
     started = datetime.now(UTC)
-    rows, timings = run_dataset(
-        dataset, params, methods=chosen, seed=seed, n_jobs=n_jobs, manifest=manifest, show_progress=show_progress
-    )
-    write_metrics(rows, out / "metrics.csv")
-    write_timings(timings, out / "timings.csv")
-    parameters = run_parameters(params, chosen)
-    inputs = _input_hashes(dataset, {name for row in rows for name in (row["subject"], row["target"])}, manifest)
-    write_json(provenance(parameters, seed, inputs, started, datetime.now(UTC)), out / "provenance.json")
-    write_tables(pd.DataFrame(rows), out)
-    if all(row["status"].startswith(FAILED) for row in rows):
-        reasons = sorted({row["status"].removeprefix(FAILED) for row in rows})
-        raise StudyError(f"{dataset}: every case failed: {' | '.join(reasons)}")
+    rows, timings = run_dataset(dataset, methods=chosen, n_jobs=n_jobs, show_progress=show_progress)
+    inputs = input_hashes(dataset)
+    return write_run(out, rows, timings, run_parameters(dataset, chosen), dataset.seed, inputs, started)
 
 
-def run_parameters(params: StudyParams, methods: Iterable[str] | None = None) -> dict[str, Any]:
+def run_parameters(dataset: Dataset, methods: Iterable[str] | None = None) -> dict[str, Any]:
     """Every parameter of a run, for its provenance."""
-    return {"study": asdict(params), "methods": {name: asdict(METHODS[name]) for name in _chosen(methods)}}
+    chosen = chosen_methods(methods)
+    return {"study": asdict(dataset.params), "methods": {name: asdict(METHODS[name]) for name in chosen}}
 
 
-def load_or_run(
-    dataset: str, params: StudyParams, folder: Path, *, seed: int = 0, n_jobs: int = 1, show_progress: bool = False
-) -> tuple[pd.DataFrame, str]:
-    """The metrics of a dataset: those in ``folder`` if the code and parameters of now made them, else of a new run.
-
-    Returns:
-        rows as `read_metrics` gives them, and a sentence that says where they are from.
-
-    Raises:
-        StudyError: as `run_study`.
-    """
-    reason = why_stale(folder, run_parameters(params), seed)
-    if reason is not None:
-        run_study(dataset, params, folder, seed=seed, n_jobs=n_jobs, show_progress=show_progress)
-    metrics = read_metrics(folder / "metrics.csv")
-    return metrics, "loaded: code, parameters and seed are those of now" if reason is None else f"run now: {reason}"
-
-
-def _input_hashes(dataset: str, names: Iterable[str], manifest: Manifest) -> dict[str, str]:
-    """SHA-256 of the manifest and of every file the subjects were read from; of a series, of all its slices."""
-    inputs = {manifest.path.name: sha256_of(manifest.path)}
-    for name in sorted({origin_of(dataset, name) or name for name in names}):
-        for key, path in files_of_subject(dataset, name, manifest).items():
+def input_hashes(dataset: Dataset) -> dict[str, str]:
+    """SHA-256 of the manifest and of every file the people were read from; of a series, of all its slices."""
+    inputs = {dataset.manifest.path.name: sha256_of(dataset.manifest.path)}
+    for name in sorted({dataset.origin(name) or name for name in dataset.names()}):
+        for key, path in dataset.files(name).items():
             slices = sorted(path.iterdir()) if path.is_dir() else [path]
             hashes = [sha256_of(slice_) for slice_ in slices]
             inputs[key] = hashes[0] if path.is_file() else hashlib.sha256("".join(hashes).encode()).hexdigest()
     return inputs
 
 
-def write_tables(metrics: pd.DataFrame, out: Path) -> None:
-    """Hausdorff tables in the shape of the paper's Table I: one a patient, columns the CTs.
+def open_run(dataset: str, profile: str = "full", seed: int = 0, *, show_progress: bool = False) -> Run:
+    """The run of a data set: its folder's if the code and parameters of now made it, else a new one.
 
-    One CT with several patients (the planted deformations) is turned: columns are the patients.
+    Args:
+        dataset: name of a data set.
+        profile: ``"full"`` or ``"quick"``.
+        seed: of the run.
+        show_progress: bars on standard error.
+
+    Raises:
+        StudyError: as `run_study`.
     """
-    for old in out.glob("hd_*.*"):  # of a run with other subjects
-        old.unlink()
-    targets = sorted(metrics["target"].unique())
-    dataset = metrics["dataset"].iloc[0]
-    if metrics["subject"].nunique() == 1:
-        turned = metrics.assign(subject=metrics["target"])
-        caption = f"Hausdorff distance, {dataset}: {metrics['subject'].iloc[0]} to each simulated patient"
-        write_hd_table(turned, out / "hd_table", caption=caption)
-        return
-    for target in targets:
-        stem = out / ("hd_table" if len(targets) == 1 else f"hd_table_{target}")
-        who = "the simulated patient" if target == "patient" else f"the simulated patient {target}"
-        caption = f"Hausdorff distance, {dataset}: each CT to {who}"
-        write_hd_table(metrics[metrics["target"] == target], stem, caption=caption)
-    if len(targets) > 1:
-        pairs_named = metrics.assign(subject=metrics["subject"] + " to " + metrics["target"])
-        write_hd_table(pairs_named, out / "hd_all_pairs", caption=f"Hausdorff distance, {dataset}: all ordered pairs")
+    chosen = find_dataset(dataset, find_profile(profile), seed)
+    folder = run_folder(chosen.name, profile, seed)
+    reason = Run(folder).why_stale(run_parameters(chosen), seed)
+    if reason is None:
+        return Run(folder, "loaded: code, parameters and seed are those of now")
+    run_study(chosen, folder, n_jobs=min(2, os.cpu_count() or 1), show_progress=show_progress)
+    return Run(folder, f"run now: {reason}")

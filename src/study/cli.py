@@ -16,9 +16,10 @@ from study.errors import StudyError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from study.data.manifest import Manifest
+    from study.data.schema import Manifest
+    from study.results.run import Run
 
-DATASETS = "phantom, open, planted, ribseg, totalsegmentator, or a manifest file of your own"
+DATASETS = "A name in data_manifest.yaml (`study datasets` lists them), or a manifest file of your own."
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -32,16 +33,15 @@ def data() -> None:
     """List, fetch and verify the files of a manifest."""
 
 
-def _open_dataset(dataset: str | None) -> tuple[Manifest, str | None]:
-    """The manifest and the cohort that ``--dataset`` names: a name in data_manifest.yaml, or a manifest file."""
+def _files_of(dataset: str | None) -> tuple[Manifest, str | None]:
+    """The manifest and the cohort whose files ``--dataset`` means: all when None."""
     from study.data.manifest import load_manifest
+    from study.datasets import find_dataset
 
-    if dataset is None or not dataset.endswith((".yaml", ".yml")):
-        return load_manifest(), dataset
-    manifest = load_manifest(dataset)
-    if len(manifest.cohorts) != 1:
-        raise StudyError(f"{dataset}: expected one cohort, got {', '.join(manifest.cohorts)}; give each its own file")
-    return manifest, next(iter(manifest.cohorts))
+    if dataset is None:
+        return load_manifest(), None
+    chosen = find_dataset(dataset)
+    return chosen.manifest, chosen.file_cohort
 
 
 def _print_files(table: pd.DataFrame, dataset: str | None) -> None:
@@ -55,22 +55,20 @@ def _print_files(table: pd.DataFrame, dataset: str | None) -> None:
 @click.option("--dataset", metavar="D", help="One cohort, or a manifest file; all when left out.")
 def data_list(dataset: str | None) -> None:
     """Print every file: cohort, size, licence, and whether it is here."""
-    from study.cohorts import cohort_of
-    from study.data.fetch import data_list as table
+    from study.data.store import data_list as table
 
-    manifest, name = _open_dataset(dataset)
-    _print_files(table(manifest, name and cohort_of(name)), dataset)
+    manifest, cohort = _files_of(dataset)
+    _print_files(table(manifest, cohort), dataset)
 
 
 @data.command("fetch", short_help="Download what is missing, verified.")
 @click.option("--dataset", default="open", show_default=True, metavar="D", help="The cohort, or a manifest file.")
 def data_fetch(dataset: str) -> None:
     """Download what is missing, verified, into STUDY_DATA_DIR or the platform's cache folder."""
-    from study.cohorts import cohort_of
     from study.data.fetch import fetch_all
 
-    manifest, name = _open_dataset(dataset)
-    paths = fetch_all(manifest, name and cohort_of(name), progress=True)
+    manifest, cohort = _files_of(dataset)
+    paths = fetch_all(manifest, cohort, progress=True)
     for path in paths.values():
         click.echo(path)
     if not paths:
@@ -81,62 +79,72 @@ def data_fetch(dataset: str) -> None:
 @click.option("--dataset", metavar="D", help="One cohort, or a manifest file; all when left out.")
 def data_verify(dataset: str | None) -> None:
     """Check the SHA-256 of every file; exit 1 when one is missing or wrong."""
-    from study.cohorts import cohort_of
-    from study.data.fetch import verify_all
+    from study.data.store import verify_all
 
-    manifest, name = _open_dataset(dataset)
-    table = verify_all(manifest, name and cohort_of(name))
+    manifest, cohort = _files_of(dataset)
+    table = verify_all(manifest, cohort)
     _print_files(table, dataset)
     click.get_current_context().exit(0 if (table["status"] == "verified").all() else 1)
 
 
+@cli.command("datasets", short_help="Print the names of the data sets.")
+@click.option("--reported", is_flag=True, help="Only those that the study reports.")
+def list_datasets(reported: bool) -> None:
+    """Print the names of the data sets, one a line."""
+    from study.data.manifest import load_manifest
+    from study.datasets import reported as those_reported
+
+    for name in those_reported() if reported else load_manifest().cohorts:
+        click.echo(name)
+
+
 @cli.command()
-@click.option("--dataset", default="phantom", show_default=True, metavar="D", help=DATASETS + ".")
+@click.option("--dataset", default="phantom", show_default=True, metavar="D", help=DATASETS)
 @click.option("--profile", default="full", show_default=True, metavar="quick|full", help="How much, how finely.")
 @click.option("--methods", metavar="a,b", help="Methods to run; all when left out.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1), help="Worker processes.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of results.  [default: results/runs/<dataset>]")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Folder of results.  [default: results/runs/<dataset> here for the full profile, all methods and seed 0, "
+    "else a folder of its own below results/trials]",
+)
 def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, out: Path | None) -> None:
     """Run every pair of a dataset with every method."""
     from study.batch import run_study
+    from study.datasets import find_dataset
     from study.params import find_profile
+    from study.results.run import run_folder
 
-    params = find_profile(profile)
     chosen = None if methods is None else [name.strip() for name in methods.split(",")]
-    manifest, name = _open_dataset(dataset)
-    assert name is not None
-    folder = out or Path("results") / "runs" / name
-    run_study(name, params, folder, methods=chosen, seed=seed, n_jobs=jobs, manifest=manifest, show_progress=True)
-    _report(folder)
+    people = find_dataset(dataset, find_profile(profile), seed)
+    if out is None:
+        out = run_folder(people.name, profile, seed, chosen, Path())
+    _report(run_study(people, out, methods=chosen, n_jobs=jobs, show_progress=True))
 
 
-def _report(folder: Path) -> None:
+def _report(run: Run) -> None:
     """Print what a run wrote: tables, waypoint errors, and the cases that failed with their reasons."""
-    from study.results import FAILED, read_metrics, waypoint_summary
-
-    metrics = read_metrics(folder / "metrics.csv")
-    for table in sorted(folder.glob("hd_table*.md")):
+    for table in run.tables():
         click.echo(f"\n{table.read_text(encoding='utf-8')}")
-    if metrics["metric"].str.contains("waypoint_error").any():
+    if not run.values.empty:
         click.echo("Waypoint errors, mm (sec. IV-B; paper: its own volunteer, other data)\n")
-        click.echo(waypoint_summary(metrics).round(2).to_string(index=False, na_rep="-"))
-    failed = metrics[metrics["status"].str.startswith(FAILED)]
-    for (subject, target, reason), cases in failed.groupby(["subject", "target", "status"], sort=False):
-        click.echo(f"{subject} to {target}, {', '.join(cases['method'])}: {reason}")
-    click.echo(f"metrics, tables and provenance: {folder}")
+        click.echo(run.waypoint_summary().round(2).to_string(index=False, na_rep="-"))
+    for (source, target, reason), cases in run.failures.groupby(["source", "target", "reason"], sort=False):
+        click.echo(f"{source} to {target}, {', '.join(cases['method'])}: failed: {reason}")
+    click.echo(f"metrics, tables and provenance: {run.folder}")
 
 
 @cli.command()
 @click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
 def report(folder: Path) -> None:
     """Print the tables of every run under FOLDER."""
-    runs = sorted(path.parent for path in folder.rglob("metrics.csv"))
-    if not runs:
-        raise StudyError(f"{folder}: expected runs with a metrics.csv below it, got none; run `study run` first")
-    for path in runs:
-        click.echo(f"\n## {path.relative_to(folder)}")
-        _report(path)
+    from study.results.run import find_runs
+
+    for run in find_runs(folder):
+        click.echo(f"\n## {run.folder.relative_to(folder)}")
+        _report(run)
     for label, pattern in (("figures", "*.png"), ("notebooks", "*.ipynb")):
         for place in sorted({path.parent for path in folder.rglob(pattern)}):
             click.echo(f"{label}: {place}")
@@ -149,16 +157,14 @@ def anatomy(dataset: str, out: Path) -> None:
     """Measure length, width, thickness, curvature and density of cartilages 2-5, and the sternum, per subject."""
     import pandas as pd
 
-    from study.anatomy import measure_anatomy
-    from study.cohorts import load_anatomy, pairs
-    from study.params import find_profile
-    from study.results import write_text
+    from study.ct.sizes import measure_anatomy
+    from study.datasets import find_dataset
+    from study.files.atomic import write_text
 
-    params = find_profile("full")
-    names = dict.fromkeys(name for pair in pairs(dataset, params) for name in pair)
+    people = find_dataset(dataset)
     tables = []
-    for name in names:
-        subject = load_anatomy(dataset, name, params)
+    for name in people.names():
+        subject = people.anatomy(name)
         if subject.image is None or subject.mask is None:
             raise StudyError(f"{dataset}: expected subjects with images, got {name} without; name another cohort")
         tables.append(measure_anatomy(subject.image, subject.mask, name))
@@ -166,7 +172,7 @@ def anatomy(dataset: str, out: Path) -> None:
     write_text(out, table.to_csv(index=False, lineterminator="\n"))
     sizes = table[table["quantity"].isin(["length", "width", "thickness", "density_mean"])]
     click.echo(sizes.pivot_table(index="part", columns="quantity", values="value", sort=False).round(1).to_string())
-    click.echo(f"{len(table)} measurements of {len(names)} subjects: {out}")
+    click.echo(f"{len(table)} measurements of {len(people.names())} subjects: {out}")
 
 
 @cli.command(short_help="Check a run against a reference.")
@@ -177,7 +183,7 @@ def compare(reference: Path, candidate: Path) -> None:
 
     Exit code 0: agrees; 1: differs, the largest differences are listed; 2: can't be compared.
     """
-    from study.results import compare as compare_runs
+    from study.results.compare import compare as compare_runs
 
     comparison = compare_runs(reference, candidate)
     click.echo(comparison.report())
@@ -193,7 +199,7 @@ def compare(reference: Path, candidate: Path) -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of results.")
 def register(ct: Path, us: Path, method: str, waypoints: Path | None, seed: int, out: Path) -> None:
     """Register two clouds of one's own (PLY, mm, any rigid pose)."""
-    from study.data.clouds import read_ply, read_waypoints, write_registration
+    from study.files.clouds import read_ply, read_waypoints, write_registration
     from study.pipeline import find_method, register_pair
 
     find_method(method)
@@ -218,10 +224,10 @@ def cloud(
     ct: Path, labels: Path | None, label_map: str, landmarks: Path | None, points: int, seed: int, out: Path
 ) -> None:
     """Cartilage cloud of a CT of one's own, from labels or landmarks."""
-    from study.cohorts import read_anatomy
-    from study.data.clouds import as_ply_path, write_ply
     from study.data.manifest import load_manifest
-    from study.pipeline import named_rng
+    from study.datasets import read_anatomy
+    from study.files.clouds import as_ply_path, write_ply
+    from study.seeds import named_rng
 
     out = as_ply_path(out)
     ids = load_manifest().label_ids(label_map)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from zlib import crc32
+from time import perf_counter
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
-from study.coarse import Alignment, align
+from study.alignment.chest import Alignment, align
 from study.errors import StudyError
-from study.methods import METHODS
-from study.types import Method, PointCloud, Registration, as_points
 
-
-def named_rng(seed: int, name: str) -> np.random.Generator:
-    """A generator that depends on what is computed, not on when: seed plus a checksum of the name."""
-    if seed < 0:
-        raise StudyError(f"expected a seed of 0 or more, got {seed}")
-    return np.random.default_rng([seed, crc32(name.encode())])
+# The methods import these, and with them Open3D, trimesh and pycpd, on first use. Whoever runs methods, here or in a
+# batch, loads them before: a limit of threads holds only for the pools that are there when it is set, and Open3D brings
+# one; nor does the clock measure an import.
+from study.methods import METHODS, drift, mesh  # noqa: F401
+from study.registration import Method, Registration
+from study.seeds import named_rng
+from study.types import PointCloud, as_points
 
 
 def find_method(name: str) -> Method:
@@ -28,22 +28,8 @@ def find_method(name: str) -> Method:
         StudyError: no such method.
     """
     if name not in METHODS:
-        raise StudyError(f"expected a method among {', '.join(METHODS)}, got {name!r}")
+        raise StudyError(f"expected a method among {', '.join(METHODS)}, got {name!r}; check the spelling")
     return METHODS[name]
-
-
-def register_aligned(alignment: Alignment, method: Method, rng: np.random.Generator) -> Registration:
-    """Run one method from a coarse alignment.
-
-    The method sees both clouds in the US frame; the result is expressed from the CT cloud's own frame.
-    """
-    source, T0 = alignment.source.cloud, alignment.T_us_ct
-    result = method.register(source.moved(T0), alignment.target.cloud, rng)
-    return replace(
-        result,
-        source=source.points,
-        T_us_ct=result.T_us_ct @ T0,
-    )
 
 
 def register_pair(
@@ -61,8 +47,83 @@ def register_pair(
         the registration: ``warped`` (n, 3) mm in the US cloud's frame, ``transfer`` for waypoints.
 
     Raises:
-        StudyError: bad arrays, no sternum, a missing branch, an unknown method.
+        StudyError: bad arrays, no sternum, a missing branch, an unknown method, or a method that failed.
+
+    Two made-up people, and where the second one's ultrasound frame has the first one's waypoints:
+
+        >>> import numpy as np
+        >>> from study import phantom
+        >>> rng = np.random.default_rng(0)
+        >>> person, patient = phantom.draw_subject("ct1", 0), phantom.draw_subject("patient", 0)
+        >>> ct = phantom.reference_cloud(person, 3000, rng).points
+        >>> us = phantom.anterior_cloud(patient, 2000, 0.5, 0, rng).points
+        >>> pair = register_pair(ct, us, "icp")
+        >>> pair.warped.shape, pair.stop_reason
+        ((3000, 3), 'iteration limit of 30 reached')
+        >>> pair.transfer(phantom.waypoints(person).points).shape
+        (20, 3)
     """
     chosen = find_method(method)
     alignment = align(PointCloud(as_points(ct_points, "ct"), "ct"), PointCloud(as_points(us_points, "us"), "us"))
-    return replace(register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}")), method=method)
+    return register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
+
+
+def register_aligned(
+    alignment: Alignment, method: Method, rng: np.random.Generator, name: str | None = None
+) -> Registration:
+    """Run one method from a coarse alignment (sec. III-B, III-C).
+
+    The method sees both clouds in the US frame; the result is expressed from the CT cloud's own frame.
+
+    Args:
+        alignment: the two chests and the motion that overlays their sternums.
+        method: the method.
+        rng: its draws.
+        name: what the result calls the method; its own name when None.
+
+    Raises:
+        StudyError: as `run_method`.
+    """
+    source, T0 = alignment.source.cloud, alignment.T_us_ct
+    result = run_method(method, source.moved(T0), alignment.target.cloud, rng, name)
+    return replace(result, source=source.points, T_us_ct=result.T_us_ct @ T0)
+
+
+def run_method(
+    method: Method, source: PointCloud, target: PointCloud, rng: np.random.Generator, name: str | None = None
+) -> Registration:
+    """Run one method on clouds in one frame, on one thread, against the clock, and check what it returns.
+
+    Args:
+        method: the method.
+        source: labelled CT cloud, coarsely aligned.
+        target: labelled US cloud.
+        rng: draws of the method.
+        name: what the result calls the method; its own name when None.
+
+    Raises:
+        StudyError: what the method raises, or an answer without one finite place per source point.
+    """
+    name = name or method.name
+    # Sums of several threads come in the order in which the threads finish: the last bits would change by the run.
+    with threadpool_limits(limits=1):
+        start = perf_counter()
+        result = method.register(source, target, rng)
+        seconds = perf_counter() - start
+    _check(result, source, name)
+    return replace(result, seconds=seconds, method=name)
+
+
+def _check(result: Registration, source: PointCloud, name: str) -> None:
+    """Refuse an answer that is none: every measure after this one would take it for a place."""
+    if result.source.shape != source.points.shape or result.warped.shape != source.points.shape:
+        raise StudyError(
+            f"{name}: expected one warped point per point of {source.name!r} {source.points.shape}, "
+            f"got {result.warped.shape}; a method keeps every row and its order"
+        )
+    bad = int((~np.isfinite(result.warped)).any(axis=1).sum())
+    if bad:
+        raise StudyError(
+            f"{name}: expected finite points from {source.name!r}, got {bad} rows with NaN or infinity; "
+            "choose milder parameters or another method"
+        )

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from study.errors import StudyError
+from study.files.atomic import replacing
 
 BLOCK_BYTES = 1 << 20
 
@@ -90,12 +91,6 @@ def blocks(stream: IO[bytes]) -> Iterator[bytes]:
         yield block
 
 
-def digest(path: Path, algorithm: str = "sha256") -> str:
-    """Hex digest of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, algorithm).hexdigest()
-
-
 def write_checked(
     content: Iterable[bytes],
     target: Path,
@@ -107,14 +102,14 @@ def write_checked(
 ) -> str:
     """Write ``content`` beside ``target``, check it, and only then give it its name; returns its sha256.
 
+    The caller sees to it that no other process writes the same target.
+
     Raises:
         StudyError: another length, CRC-32 or sha256 than expected; nothing is left behind.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(target.name + ".tmp")
     hashed, checksum, length = hashlib.sha256(), 0, 0
     where = where or target.name
-    try:
+    with replacing(target, alone=True) as temporary:
         with temporary.open("wb") as file:
             for block in content:
                 length += len(block)
@@ -130,7 +125,4 @@ def write_checked(
             raise StudyError(f"{where}: expected CRC-32 {crc32:08x}, got {checksum:08x}; {advice}")
         if sha256 is not None and hashed.hexdigest() != sha256:
             raise StudyError(f"{where}: expected sha256 {sha256}, got {hashed.hexdigest()}; {advice}")
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
     return hashed.hexdigest()

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NoReturn
 from urllib.parse import urlsplit, urlunsplit
 
 import requests
@@ -86,7 +87,14 @@ class Web:
             yield response
 
     def download(
-        self, url: str, part: Path, n_bytes: int, *, offset: int = 0, whole: bool = False, bar: tqdm | None = None
+        self,
+        url: str,
+        part: Path,
+        n_bytes: int,
+        *,
+        offset: int = 0,
+        whole: bool = False,
+        bar: tqdm[NoReturn] | None = None,
     ) -> None:
         """Grow ``part`` until it holds ``n_bytes`` bytes of ``url`` from ``offset`` on.
 
@@ -127,7 +135,7 @@ class Web:
             time.sleep(self.backoff_s * 2**failures)
 
     def _append(
-        self, url: str, part: Path, have: int, until: int, offset: int, *, whole: bool, bar: tqdm | None
+        self, url: str, part: Path, have: int, until: int, offset: int, *, whole: bool, bar: tqdm[NoReturn] | None
     ) -> None:
         first, last = offset + have, offset + until - 1
         ranged = have > 0 or not whole

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from remotezip import RangeNotSupported, RemoteIOError, RemoteZip, RemoteZipError
 from tqdm import tqdm
@@ -52,7 +53,9 @@ class RemoteArchive:
             )
         return info
 
-    def fetch(self, wanted: str, target: Path, *, sha256: str | None, n_bytes: int | None, bar: tqdm | None) -> str:
+    def fetch(
+        self, wanted: str, target: Path, *, sha256: str | None, n_bytes: int | None, bar: tqdm[NoReturn] | None
+    ) -> str:
         """Write one member to ``target``, checked; returns its sha256.
 
         The compressed bytes are kept in a part file beside the target until the member is complete, under a name

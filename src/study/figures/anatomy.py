@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
 from study.errors import StudyError
-from study.figures.style import (
-    PART_COLOUR,
+from study.figures.canvas import (
     WIDTH_IN,
     bounds,
     dots,
@@ -21,62 +21,16 @@ from study.figures.style import (
     look,
     name_parts,
     new_figure,
-    part_colours,
     part_legend,
     project,
     require,
 )
-from study.types import (
-    Floats,
-    Ints,
-    Mesh,
-    Part,
-    PointCloud,
-    RigidTransform,
-    Volume,
-)
+from study.figures.style import PART_COLOUR, part_colours
+from study.types import Floats, Ints, Mesh, Part, PointCloud, RigidTransform, Volume
+
+__all__ = ["anatomy_overview", "ct_slice", "mesh_and_cloud"]
 
 _DRAWN: Mapping[Part, Any] = {part: colour for part, colour in PART_COLOUR.items() if part != Part.UNKNOWN}
-
-
-def _grid_mm(volume: Volume, axis: int) -> Floats:
-    """Voxel centres along one axis of the grid, mm; RAS+ where the grid is not tilted."""
-    return volume.T_ras_index.translation[axis] + np.arange(volume.shape[axis]) * volume.spacing_mm[axis]
-
-
-def _place(volume: Volume, mask: Volume) -> Ints:
-    """The voxel of ``volume`` that is ``mask``'s first."""
-    start = volume.to_index(mask.to_mm([[0, 0, 0]]))[0]
-    first = np.round(start).astype(np.int64)
-    same = np.allclose(volume.spacing_mm, mask.spacing_mm) and np.allclose(start, first, atol=0.05)
-    if not same or (first < 0).any() or (first + mask.shape > volume.shape).any():
-        raise StudyError(f"expected a mask on the grid of {volume.name}, got another grid; crop or resample, not both")
-    require(np.flatnonzero(mask.values >= 0), f"labelled voxels of {mask.name}")
-    return first
-
-
-def _part_contours(ax: Axes, xy: Sequence[Floats], parts: Ints, colours: Mapping[Part, Any], **style: Any) -> None:
-    for part, colour in colours.items():
-        inside = parts == part
-        if inside.any():
-            padded = np.pad(inside, 1).T.astype(float)
-            wide = [np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in xy]
-            drawn = ax.contour(*wide, padded, levels=[0.5], colors=[colour], **style)
-            drawn.set_path_effects([withStroke(linewidth=style["linewidths"] + 1.4, foreground="black")])
-
-
-def _grey_image(ax: Axes, values: ArrayLike, x: Floats, y: Floats, window: tuple[float, float]) -> None:
-    """``values[i, j]`` at x[i], y[j]; both rise or both axes are turned so that they do."""
-    dx, dy = abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2
-    extent = (x.min() - dx, x.max() + dx, y.min() - dy, y.max() + dy)
-    image = np.asarray(values)[np.argsort(x)][:, np.argsort(y)].T
-    ax.imshow(image, cmap="gray", vmin=window[0], vmax=window[1], extent=extent, origin="lower", rasterized=True)
-
-
-def _best_slice(mask: Volume, axis: int) -> int:
-    """The slice that shows most: many parts count as much as large ones, hence the root of each part's area."""
-    planes = np.moveaxis(mask.values, axis, 0).reshape(mask.shape[axis], -1)
-    return int(np.argmax(np.sum([np.sqrt((planes == part).sum(axis=1)) for part in _DRAWN], axis=0)))
 
 
 def ct_slice(
@@ -99,50 +53,115 @@ def ct_slice(
         margin_mm: shown around the mask.
 
     Raises:
-        StudyError: an empty mask, or one on another grid.
+        StudyError: an empty mask, one on another grid, or a place outside it.
     """
     first = _place(volume, mask)
-    labelled = mask.values >= 0
-    if at_mm is None:
-        cut = [_best_slice(mask, axis) for axis in range(3)]
-    else:
-        cut = np.round(mask.to_index(np.reshape(at_mm, (1, 3)))[0]).astype(int).tolist()
-        if not all(0 <= index < n for index, n in zip(cut, mask.shape, strict=True)):
-            raise StudyError(f"expected a place inside {mask.name}, got {at_mm} mm; take a point of the mask")
-    boxes = [np.flatnonzero(labelled.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
-    x = -_grid_mm(volume, 0)
-    views, shown = [], set()
-    for axis, up, title in ((2, 1, "axial"), (1, 2, "coronal")):
-        y = _grid_mm(volume, up)
-        mine = [grid[first[a] : first[a] + mask.shape[a]] for a, grid in ((0, x), (up, y))]
-        (xa, xb), (ya, yb) = (
-            (grid[box[0]], grid[box[-1]]) for grid, box in zip(mine, (boxes[0], boxes[up]), strict=True)
-        )
-        extent = np.array([[min(xa, xb) - margin_mm, ya - margin_mm], [max(xa, xb) + margin_mm, yb + margin_mm]])
-        parts = np.take(mask.values, cut[axis], axis)
-        shown |= {part for part in _DRAWN if (parts == part).any()}
-        views.append((axis, up, title, y, mine, extent, parts))
-    heights = [float(np.ptp(extent[:, 1])) for *_, extent, _ in views]
-    scale = min((WIDTH_IN - 1.0) / float(np.ptp(views[0][5][:, 0])), 8.0 / sum(heights))  # inches a mm
-    figure = new_figure(
-        scale * sum(heights) + 2.1, f"{volume.name}: parts on the CT, window {window_hu[0]:g} to {window_hu[1]:g} HU"
-    )
-    panels = figure.subplots(2, 1, height_ratios=heights)
-    for ax, (axis, up, title, y, mine, extent, parts) in zip(panels, views, strict=True):
-        _grey_image(ax, np.take(volume.values, first[axis] + cut[axis], axis), x, y, window_hu)
-        _part_contours(ax, mine, parts, _DRAWN, linewidths=1.4)
+    cut = [_best_slice(mask, axis) for axis in range(3)] if at_mm is None else _slice_at(mask, at_mm)
+    slices = [_cut(volume, mask, first, cut, axis, margin_mm) for axis in (2, 1)]
+    heights = [float(np.ptp(one.extent[:, 1])) for one in slices]
+    scale = min((WIDTH_IN - 1.0) / float(np.ptp(slices[0].extent[:, 0])), 8.0 / sum(heights))  # inches a mm
+    title = f"{volume.name}: parts on the CT, window {window_hu[0]:g} to {window_hu[1]:g} HU"
+    figure = new_figure(scale * sum(heights) + 2.1, title)
+    for ax, one in zip(figure.subplots(2, 1, height_ratios=heights), slices, strict=True):
+        _grey_image(ax, np.take(volume.values, first[one.axis] + one.index, one.axis), one.x, one.y, window_hu)
+        _part_contours(ax, one.xy_mask, one.parts, _DRAWN, linewidths=1.4)
         if reference is not None:
             white: Mapping[Part, Any] = dict.fromkeys(_DRAWN, "white")
-            other = np.take(mask.with_values(reference.values).values, cut[axis], axis)
-            _part_contours(ax, mine, other, white, linewidths=0.9, linestyles="dashed")
+            other = np.take(mask.with_values(reference.values).values, one.index, one.axis)
+            _part_contours(ax, one.xy_mask, other, white, linewidths=0.9, linestyles="dashed")
         if at_mm is not None:
             place_mm = np.asarray(at_mm, dtype=np.float64).ravel()
-            ax.scatter(-place_mm[0], place_mm[up], s=260, fc="none", ec="#F0E442", lw=1.6, zorder=5)
-        place = _grid_mm(volume, axis)[first[axis] + cut[axis]]
-        look(ax, "front", extent, f"{title}, {'S' if axis == 2 else 'A'} = {place:.1f} mm", on_dark=True)
-        ax.set_ylabel("to the front (mm)" if up == 1 else "up (mm)", fontsize=8)
-    part_legend(figure, shown=shown)
+            ax.scatter(-place_mm[0], place_mm[one.up], s=260, fc="none", ec="#F0E442", lw=1.6, zorder=5)
+        name, letter = ("axial", "S") if one.axis == 2 else ("coronal", "A")
+        depth_mm = _grid_mm(volume, one.axis)[first[one.axis] + one.index]
+        look(ax, "front", one.extent, f"{name}, {letter} = {depth_mm:.1f} mm", on_dark=True)
+        ax.set_ylabel("to the front (mm)" if one.up == 1 else "up (mm)", fontsize=8)
+    part_legend(figure, shown={part for part in _DRAWN if any((one.parts == part).any() for one in slices)})
     return figure
+
+
+@dataclass(frozen=True)
+class _Slice:
+    """An axial or coronal slice, the patient's left to the right of the page.
+
+    Attributes:
+        axis: the axis it cuts, 2 or 1.
+        up: the axis up the page, 1 or 2.
+        index: of the mask's grid, along ``axis``.
+        x, y: voxel centres of the volume across and up the page, mm.
+        xy_mask: the same of the mask.
+        parts: (len of each of ``xy_mask``) of `Part`.
+        extent: (2, 2) mm, corners of what is shown: the labelled box and its margin.
+    """
+
+    axis: int
+    up: int
+    index: int
+    x: Floats
+    y: Floats
+    xy_mask: list[Floats]
+    parts: Ints
+    extent: Floats
+
+
+def _cut(volume: Volume, mask: Volume, first: Ints, cut: Sequence[int], axis: int, margin_mm: float) -> _Slice:
+    up = 3 - axis
+    x, y = -_grid_mm(volume, 0), _grid_mm(volume, up)
+    xy_mask = [grid[first[a] : first[a] + mask.shape[a]] for a, grid in ((0, x), (up, y))]
+    boxes = [np.flatnonzero((mask.values >= 0).any(axis=tuple({0, 1, 2} - {a}))) for a in (0, up)]
+    (xa, xb), (ya, yb) = ((grid[box[0]], grid[box[-1]]) for grid, box in zip(xy_mask, boxes, strict=True))
+    extent = np.array([[min(xa, xb) - margin_mm, ya - margin_mm], [max(xa, xb) + margin_mm, yb + margin_mm]])
+    return _Slice(axis, up, cut[axis], x, y, xy_mask, np.take(mask.values, cut[axis], axis), extent)
+
+
+def _slice_at(mask: Volume, at_mm: ArrayLike) -> list[int]:
+    """The voxel of the mask at a place, one index an axis."""
+    cut: list[int] = np.round(mask.to_index(np.reshape(at_mm, (1, 3)))[0]).astype(int).tolist()
+    if not all(0 <= index < n for index, n in zip(cut, mask.shape, strict=True)):
+        raise StudyError(f"expected a place inside {mask.name}, got {np.asarray(at_mm)} mm; take a point of the mask")
+    return cut
+
+
+def _grid_mm(volume: Volume, axis: int) -> Floats:
+    """Voxel centres along one axis of the grid, mm; RAS+ where the grid is not tilted."""
+    centres = volume.T_ras_index.translation[axis] + np.arange(volume.shape[axis]) * volume.spacing_mm[axis]
+    return np.asarray(centres, dtype=np.float64)
+
+
+def _place(volume: Volume, mask: Volume) -> Ints:
+    """The voxel of ``volume`` that is ``mask``'s first."""
+    start = volume.to_index(mask.to_mm([[0, 0, 0]]))[0]
+    first: Ints = np.round(start).astype(np.int64)
+    same = np.allclose(volume.spacing_mm, mask.spacing_mm) and np.allclose(start, first, atol=0.05)
+    if not same or (first < 0).any() or (first + mask.shape > volume.shape).any():
+        raise StudyError(f"expected a mask on the grid of {volume.name}, got another grid; crop or resample, not both")
+    require(np.flatnonzero(mask.values >= 0), f"labelled voxels of {mask.name}")
+    return first
+
+
+def _part_contours(ax: Axes, xy: Sequence[Floats], parts: Ints, colours: Mapping[Part, Any], **style: Any) -> None:
+    """The outline of each part that is in ``parts[i, j]`` at x[i], y[j] of ``xy``, with a dark halo."""
+    for part, colour in colours.items():
+        inside = parts == part
+        if inside.any():
+            padded = np.pad(inside, 1).T.astype(float)
+            wide = [np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in xy]
+            drawn = ax.contour(*wide, padded, levels=[0.5], colors=[colour], **style)
+            drawn.set_path_effects([withStroke(linewidth=style["linewidths"] + 1.4, foreground="black")])
+
+
+def _grey_image(ax: Axes, values: ArrayLike, x: Floats, y: Floats, window: tuple[float, float]) -> None:
+    """``values[i, j]`` at x[i], y[j]; both rise or both axes are turned so that they do."""
+    dx, dy = abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2
+    extent = (x.min() - dx, x.max() + dx, y.min() - dy, y.max() + dy)
+    image = np.asarray(values)[np.argsort(x)][:, np.argsort(y)].T
+    ax.imshow(image, cmap="gray", vmin=window[0], vmax=window[1], extent=extent, origin="lower", rasterized=True)
+
+
+def _best_slice(mask: Volume, axis: int) -> int:
+    """The slice that shows most: many parts count as much as large ones, hence the root of each part's area."""
+    planes = np.moveaxis(mask.values, axis, 0).reshape(mask.shape[axis], -1)
+    return int(np.argmax(np.sum([np.sqrt((planes == part).sum(axis=1)) for part in _DRAWN], axis=0)))
 
 
 def anatomy_overview(

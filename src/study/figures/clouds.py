@@ -11,20 +11,22 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
 from study.errors import StudyError
-from study.figures.style import (
+from study.figures.canvas import (
     WIDTH_IN,
     bounds,
     dots,
     draw_surface,
     look,
     new_figure,
-    part_colours,
     part_legend,
     plain,
     project,
     require,
 )
+from study.figures.style import part_colours
 from study.types import CARTILAGES, Mesh, Part, PointCloud, RigidTransform
+
+__all__ = ["cloud_errors", "pose_gallery"]
 
 
 def pose_gallery(clouds: Mapping[str, PointCloud], title: str = "Seen along the third axis of its own frame") -> Figure:

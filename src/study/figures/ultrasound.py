@@ -13,11 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from study.errors import StudyError
-from study.figures.style import (
-    CT_COLOUR,
-    DARK,
-    LEVEL_COLOUR,
-    US_COLOUR,
+from study.figures.canvas import (
     WIDTH_IN,
     View,
     below,
@@ -29,14 +25,12 @@ from study.figures.style import (
     plain,
     project,
     require,
-    steps,
     thin,
 )
-from study.types import (
-    Mesh,
-    PointCloud,
-    RigidTransform,
-)
+from study.figures.style import CT_COLOUR, DARK, LEVEL_COLOUR, US_COLOUR, steps
+from study.types import Mesh, PointCloud, RigidTransform
+
+__all__ = ["frame_with_mask", "latency_fit", "sweep_in_space"]
 
 
 def sweep_in_space(
@@ -81,7 +75,7 @@ def sweep_in_space(
             ax.add_collection(LineCollection(list(pages), colors=DARK, linewidths=0.5, alpha=0.35))
         rows = np.flatnonzero(tracked)[thin(int(tracked.sum()), 3000)]
         line = project(path[rows], view, T_cloud_chest)
-        drawn = ax.scatter(*line[:, :2].T, c=clock[rows], s=4, cmap=steps("plasma"), lw=0, rasterized=True)
+        drawn = ax.scatter(line[:, 0], line[:, 1], c=clock[rows], s=4, cmap=steps("plasma"), lw=0, rasterized=True)
         look(ax, view, extent, title)
     bar = figure.colorbar(drawn, ax=panels, shrink=0.7, pad=0.01)
     bar.set_label("pose number" if times_s is None else "time of the sweep (s)", fontsize=8)

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from study.types import PointCloud, Registration, RigidTransform
+from study.registration import Registration
+from study.types import PointCloud, RigidTransform
 
 
 @dataclass(frozen=True)
@@ -25,5 +26,4 @@ class CoarseOnly:
             converged=True,
             n_iterations=0,
             stop_reason="nothing to iterate",
-            method=self.name,
         )

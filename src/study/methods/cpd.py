@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from pycpd import DeformableRegistration
 from scipy.spatial.distance import cdist
-from threadpoolctl import threadpool_limits
 
 from study.errors import StudyError
-from study.geometry import farthest_points
-from study.types import Floats, PointCloud, Registration, RigidTransform
+from study.geometry.points import farthest_points
+from study.registration import Registration
+from study.types import Floats, PointCloud, RigidTransform
+
+if TYPE_CHECKING:
+    from study.methods.drift import Drift
 
 _ROWS = 10_000  # rows of the extension at a time, to bound memory
 
@@ -45,15 +46,15 @@ class Cpd:
     max_points: int = 1000
 
     def __post_init__(self) -> None:
-        if min(self.alpha, self.beta_mm) <= 0 or not 0 <= self.outlier_share < 1:
+        if not (self.alpha > 0 and self.beta_mm > 0 and 0 <= self.outlier_share < 1):
             raise StudyError(
                 "cpd: expected alpha > 0, beta_mm > 0 and 0 <= outlier_share < 1, "
-                f"got {self.alpha}, {self.beta_mm} and {self.outlier_share}"
+                f"got {self.alpha}, {self.beta_mm} and {self.outlier_share}; Cpd() has pycpd's own"
             )
-        if self.max_iterations < 1 or self.max_points < 4:
+        if not (self.max_iterations >= 1 and self.max_points >= 4 and self.tolerance >= 0):
             raise StudyError(
-                "cpd: expected max_iterations >= 1 and max_points >= 4, "
-                f"got {self.max_iterations} and {self.max_points}"
+                "cpd: expected max_iterations >= 1, max_points >= 4 and tolerance >= 0, "
+                f"got {self.max_iterations}, {self.max_points} and {self.tolerance}; a tolerance of 0 runs to the limit"
             )
 
     @classmethod
@@ -65,64 +66,45 @@ class Cpd:
         """Drift ``source`` onto ``target``; nothing is drawn from ``rng``.
 
         ``history`` is the standard deviation of the mixture's Gaussians, mm.
-
-        Raises:
-            StudyError: the fit gave numbers that are not finite.
         """
-        start = perf_counter()
         centre = source.points.mean(axis=0)
         moving, fixed = source.points - centre, target.points - centre
         control = moving[farthest_points(moving, self.max_points)]
-        history: list[float] = []
-        with threadpool_limits(limits=1):  # sums of a threaded BLAS depend on the number of threads
-            drift = _Drift(
-                X=fixed[farthest_points(fixed, self.max_points)],
-                Y=control,
-                alpha=self.alpha,
-                beta=self.beta_mm,
-                w=self.outlier_share,
-                max_iterations=self.max_iterations,
-                tolerance=self.tolerance,
-            )
-            drift.register(lambda **_: history.append(float(np.sqrt(drift.sigma2))))
-            warped = centre + np.vstack(
-                [
-                    rows + np.exp(-cdist(rows, control, "sqeuclidean") / (2 * self.beta_mm**2)) @ drift.W
-                    for rows in np.split(moving, range(_ROWS, len(moving), _ROWS))
-                ]
-            )
-        if not np.isfinite(warped).all():
-            raise StudyError(f"cpd: expected finite points from {source.name!r}, got NaN; raise alpha or outlier_share")
+        drift, history = self._drift(control, fixed[farthest_points(fixed, self.max_points)])
         converged = bool(drift.diff <= self.tolerance)
+        limit = f"iteration limit of {self.max_iterations} reached"
         return Registration(
             source=source.points,
-            warped=warped,
+            warped=centre + self._extend(moving, control, drift.W),
             T_us_ct=RigidTransform(),
             converged=converged,
             n_iterations=len(history),
-            stop_reason=(
-                "variance stopped changing" if converged else f"iteration limit of {self.max_iterations} reached"
-            ),
+            stop_reason="variance stopped changing" if converged else limit,
             history=tuple(history),
-            seconds=perf_counter() - start,
-            method=self.name,
-            extras={"n_control": len(control)},
         )
 
+    def _drift(self, control: Floats, fixed: Floats) -> tuple[Drift, list[float]]:
+        """The finished fit of ``control`` (m, 3) to ``fixed`` (n, 3), and its standard deviation by iteration."""
+        from study.methods.drift import Drift  # brings pycpd, which takes seconds to import
 
-class _Drift(DeformableRegistration):
-    """pycpd's two costly steps without their (m, n, 3) and diagonal arrays: same numbers in a third of the time."""
+        drift = Drift(
+            X=fixed,
+            Y=control,
+            alpha=self.alpha,
+            beta=self.beta_mm,
+            w=self.outlier_share,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+        )
+        history: list[float] = []
+        drift.register(lambda **_: history.append(float(np.sqrt(drift.sigma2))))
+        return drift, history
 
-    def expectation(self) -> None:
-        p = np.exp(-cdist(self.TY, self.X, "sqeuclidean") / (2 * self.sigma2))
-        uniform = (2 * np.pi * self.sigma2) ** (self.D / 2) * self.w / (1 - self.w) * self.M / self.N
-        total = p.sum(axis=0)
-        total[total == 0] = np.finfo(float).eps
-        self.P = p / (total + uniform)
-        self.Pt1, self.P1 = self.P.sum(axis=0), self.P.sum(axis=1)
-        self.Np = self.P1.sum()
-
-    def update_transform(self) -> None:
-        system: Floats = self.P1[:, None] * self.G
-        system.flat[:: self.M + 1] += self.alpha * self.sigma2
-        self.W: Any = np.linalg.solve(system, self.P @ self.X - self.P1[:, None] * self.Y)
+    def _extend(self, moving: Floats, control: Floats, weights: Floats) -> Floats:
+        """All points (n, 3) moved by the kernel that was fitted at the control points."""
+        return np.vstack(
+            [
+                rows + np.exp(-cdist(rows, control, "sqeuclidean") / (2 * self.beta_mm**2)) @ weights
+                for rows in np.split(moving, range(_ROWS, len(moving), _ROWS))
+            ]
+        )

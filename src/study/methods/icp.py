@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
 from typing import ClassVar
 
 import numpy as np
-import open3d as o3d
-from threadpoolctl import threadpool_limits
 
 from study.errors import StudyError
-from study.geometry import principal_axes
-from study.types import Floats, PointCloud, Registration, RigidTransform
+from study.geometry.points import principal_axes
+from study.registration import Registration
+from study.types import Floats, PointCloud, RigidTransform
 
 
 @dataclass(frozen=True)
@@ -37,10 +35,15 @@ class Icp:
     relative_rmse: float = 1e-6
 
     def __post_init__(self) -> None:
-        if self.max_distance_mm <= 0 or self.max_iterations < 1:
+        if not (self.max_distance_mm > 0 and self.max_iterations >= 1):
             raise StudyError(
-                f"icp: expected max_distance_mm > 0 and max_iterations >= 1, "
-                f"got {self.max_distance_mm} and {self.max_iterations}"
+                "icp: expected max_distance_mm > 0 and max_iterations >= 1, "
+                f"got {self.max_distance_mm} and {self.max_iterations}; 1000 mm leaves no pair out"
+            )
+        if not (self.relative_fitness >= 0 and self.relative_rmse >= 0):
+            raise StudyError(
+                "icp: expected relative_fitness >= 0 and relative_rmse >= 0, "
+                f"got {self.relative_fitness} and {self.relative_rmse}; 0 runs to the limit"
             )
 
     @classmethod
@@ -56,15 +59,11 @@ class Icp:
         Raises:
             StudyError: no target point within ``max_distance_mm`` of any source point.
         """
-        start = perf_counter()
         # Its point-to-plane update turns about the origin in small angles, so it runs in the source's own axes: the
         # answer does not depend on where a tracker has its origin.
         centre, axes = principal_axes(source.points)
         T_axes = RigidTransform(axes, -axes @ centre)
-        # With two threads Open3D adds its pairs up in the order in which the threads finish: the last bits would change
-        # from run to run.
-        with threadpool_limits(limits=1):
-            matrix, history, converged = self._run(T_axes.apply(source.points), T_axes.apply(target.points))
+        matrix, history, converged = self._run(T_axes.apply(source.points), T_axes.apply(target.points))
         T_us_ct = T_axes.inverse @ RigidTransform.from_matrix(matrix) @ T_axes
         limit = f"iteration limit of {self.max_iterations} reached"
         return Registration(
@@ -75,14 +74,16 @@ class Icp:
             n_iterations=len(history),
             stop_reason="share of pairs and their distance stopped changing" if converged else limit,
             history=tuple(history),
-            seconds=perf_counter() - start,
-            method=self.name,
         )
 
     def _run(self, source: Floats, target: Floats) -> tuple[Floats, list[float], bool]:
         """Open3D's loop, one update a call: called once, it does not tell whether or when it converged."""
+        import open3d as o3d  # takes seconds; who reads results by their method's name needs none of it
+
         registration = o3d.pipelines.registration
-        moving, fixed = _open3d_cloud(source), _open3d_cloud(target)
+        moving, fixed = (
+            o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points))) for points in (source, target)
+        )
         estimation = registration.TransformationEstimationPointToPoint()
         if self.point_to_plane:
             fixed.estimate_normals()
@@ -108,7 +109,3 @@ class Icp:
             ):
                 return state.transformation, history, True
         return state.transformation, history, False
-
-
-def _open3d_cloud(points: Floats) -> o3d.geometry.PointCloud:
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(points)))

@@ -8,10 +8,11 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import KDTree
 
-from study.coarse import chest_frame
+from study.alignment.frame import ChestFrame, chest_frame
 from study.errors import StudyError
-from study.geometry import fit_rigid_batch, sample_spacing_mm
-from study.types import Bools, ChestFrame, Floats, Method, PointCloud, Registration
+from study.geometry.points import fit_rigid_batch, foremost_in_cells, sample_spacing_mm
+from study.registration import Method, Registration
+from study.types import Bools, Floats, PointCloud
 
 
 def faces_front(points: Floats, frame: ChestFrame, cell_mm: float = 4.0, depth_mm: float = 3.0) -> Bools:
@@ -25,11 +26,9 @@ def faces_front(points: Floats, frame: ChestFrame, cell_mm: float = 4.0, depth_m
     """
     local = frame.T_cloud_chest.inverse.apply(points)
     cell_mm = max(cell_mm, 2.5 * sample_spacing_mm(points))
-    cells = np.floor(local[:, :2] / cell_mm).astype(np.int64)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    foremost = np.full(cell.max() + 1, -np.inf)
-    np.maximum.at(foremost, cell.ravel(), local[:, 2])
-    return local[:, 2] > foremost[cell.ravel()] - depth_mm
+    cells, foremost = foremost_in_cells(local, cell_mm)
+    front: Bools = local[:, 2] > foremost[cells] - depth_mm
+    return front
 
 
 @dataclass(frozen=True)
@@ -49,15 +48,28 @@ class VisibleSurface:
     method: Method
     neighbours: int = 12
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.method, Method):
+            raise StudyError(
+                f"visible_surface: expected a registration method, got {self.method!r}; pass an instance such as Icp()"
+            )
+        if not self.neighbours >= 3:
+            raise StudyError(
+                f"visible_surface: expected neighbours >= 3, got {self.neighbours}; fewer points fix no rotation"
+            )
+
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
-        """Register labelled, coarsely aligned clouds.
+        """Register labelled, coarsely aligned clouds; the result is what ``method`` returns, on every source point.
 
         Raises:
             StudyError: fewer visible points than ``neighbours``, or what ``method`` raises.
         """
         seen = faces_front(source.points, chest_frame(source))
         if seen.sum() < self.neighbours:
-            raise StudyError(f"{source.name}: expected {self.neighbours} visible points or more, got {seen.sum()}")
+            raise StudyError(
+                f"{source.name}: expected {self.neighbours} visible points or more, got {seen.sum()}; "
+                "pass a denser cloud or fewer neighbours"
+            )
         parts = None if source.parts is None else source.parts[seen]
         result = self.method.register(replace(source, points=source.points[seen], parts=parts), target, rng)
         warped = np.empty_like(source.points)
@@ -71,4 +83,5 @@ def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Fl
     _, index = KDTree(source).query(points, k=neighbours)
     weights = np.full(index.shape, 1 / neighbours)
     rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
-    return np.einsum("nij,nj->ni", rotations, points) + translations
+    carried: Floats = np.einsum("nij,nj->ni", rotations, points) + translations
+    return carried

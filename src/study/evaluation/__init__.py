@@ -1,0 +1,75 @@
+"""Evaluation (sec. IV): a pair, its judgement, metrics, the paper's waypoints, statistics, ablation, budget, claims."""
+
+from study.evaluation.ablation import (
+    AS_AUTHORS,
+    PROTOCOL,
+    RIGID,
+    TRUE_IN_PLANE,
+    Option,
+    ablate,
+    beyond_luck,
+    changes,
+    options,
+)
+from study.evaluation.budget import Budget, Scanned, error_budget
+from study.evaluation.claims import CLAIMS, GRAPH, claims_table, differences
+from study.evaluation.comparisons import paired_tests, protocol_and_truth
+from study.evaluation.distances import (
+    CloudDistances,
+    directed_distances_mm,
+    hausdorff_mm,
+    point_errors_mm,
+    sampling_floor_mm,
+    waypoint_errors_mm,
+)
+from study.evaluation.judgement import Judgement
+from study.evaluation.metrics import METRICS, Metric, Unit, judge
+from study.evaluation.pair import TRUTH, Pair, align_pair, perfect
+from study.evaluation.poses import PoseCheck, PoseTrial, check_pose, random_pose, try_poses
+from study.evaluation.statistics import PairedTest, paired_wilcoxon, population_sd
+from study.evaluation.waypoints import intercostal_waypoints
+
+__all__ = [
+    "AS_AUTHORS",
+    "CLAIMS",
+    "GRAPH",
+    "METRICS",
+    "PROTOCOL",
+    "RIGID",
+    "TRUE_IN_PLANE",
+    "TRUTH",
+    "Budget",
+    "CloudDistances",
+    "Judgement",
+    "Metric",
+    "Option",
+    "Pair",
+    "PairedTest",
+    "PoseCheck",
+    "PoseTrial",
+    "Scanned",
+    "Unit",
+    "ablate",
+    "align_pair",
+    "beyond_luck",
+    "changes",
+    "check_pose",
+    "claims_table",
+    "differences",
+    "directed_distances_mm",
+    "error_budget",
+    "hausdorff_mm",
+    "intercostal_waypoints",
+    "judge",
+    "options",
+    "paired_tests",
+    "paired_wilcoxon",
+    "perfect",
+    "point_errors_mm",
+    "population_sd",
+    "protocol_and_truth",
+    "random_pose",
+    "sampling_floor_mm",
+    "try_poses",
+    "waypoint_errors_mm",
+]

@@ -1,0 +1,116 @@
+"""How good a registration is (sec. IV): every metric of ``metrics.csv``, what it measures, in which unit, how exactly.
+
+A metric is one entry of `METRICS`: what it is called, its unit, by how much two machines may differ, and the function
+that measures it on a `Judgement`. Nothing else in the library lists metrics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from study.evaluation.judgement import Judgement
+from study.evaluation.pair import Pair
+from study.registration import Registration
+from study.types import Floats
+
+
+class Unit(StrEnum):
+    """Unit of a metric."""
+
+    MILLIMETRES = "mm"
+    DEGREES = "deg"
+    FRACTION = "1"
+    SECONDS = "s"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What a row of ``metrics.csv`` measures.
+
+    Attributes:
+        title: for tables and axes.
+        unit: unit of the value.
+        tolerance: how far two machines may differ, in ``unit``.
+        reason: why that much and no more.
+        measure: a value, or one a waypoint, of a judged registration.
+        needs_truth: whether the pair's deformation must be known.
+    """
+
+    title: str
+    unit: Unit
+    tolerance: float
+    reason: str
+    measure: Callable[[Judgement], ArrayLike]
+    needs_truth: bool = False
+
+
+_WORST = "the worst of thousands of points: one changed partner moves it; methods differ by 1 mm and more"
+_MEAN = "a mean over thousands of points hides a changed partner; methods differ by 0.3 mm and more"
+_PLACE = "a rigid fit of hundreds of points; methods differ by 0.5 mm and more"
+_SHARE = "a percentile ignores single points"
+_MM = Unit.MILLIMETRES
+
+METRICS: Mapping[str, Metric] = MappingProxyType(
+    {
+        "hd": Metric("Hausdorff distance", _MM, 0.2, _WORST, lambda j: j.surface.hausdorff_mm),
+        "hd95": Metric("95th percentile Hausdorff distance", _MM, 0.1, _SHARE, lambda j: j.surface.hd95_mm),
+        "msd": Metric("Mean surface distance", _MM, 0.05, _MEAN, lambda j: j.surface.mean_mm),
+        "waypoint_error": Metric("Waypoint error", _MM, 0.1, _PLACE, lambda j: j.protocol_errors_mm()),
+        "waypoint_error_inplane": Metric(
+            "Waypoint error in the feature plane", _MM, 0.1, _PLACE, lambda j: j.protocol_errors_mm(in_plane=True)
+        ),
+        "true_waypoint_error": Metric(
+            "True waypoint error", _MM, 0.1, _PLACE, lambda j: j.true_waypoint_errors_mm(), needs_truth=True
+        ),
+        "true_waypoint_error_inplane": Metric(
+            "True waypoint error in the feature plane",
+            _MM,
+            0.1,
+            _PLACE,
+            lambda j: j.true_waypoint_errors_mm(in_plane=True),
+            needs_truth=True,
+        ),
+        "true_error_mean": Metric(
+            "Mean true point error", _MM, 0.05, _MEAN, lambda j: j.true_point_errors_mm.mean(), needs_truth=True
+        ),
+        "true_error_p95": Metric(
+            "95th percentile true point error",
+            _MM,
+            0.1,
+            _SHARE,
+            lambda j: np.percentile(j.true_point_errors_mm, 95),
+            needs_truth=True,
+        ),
+        "true_error_max": Metric(
+            "Largest true point error", _MM, 0.2, _WORST, lambda j: j.true_point_errors_mm.max(), needs_truth=True
+        ),
+    }
+)
+
+
+def judge(pair: Pair, registration: Registration, radius_mm: float = 20.0) -> dict[str, Floats]:
+    """Every metric of one registration (sec. IV); those that need the truth only where it is known.
+
+    Args:
+        pair: what was registered.
+        registration: in the US frame, as `study.pipeline.register_aligned` gives it.
+        radius_mm: sphere of the path transfer (sec. III-D).
+
+    Returns:
+        values (1,) or one a waypoint (k,), by the names of `METRICS`, in their units.
+
+    Raises:
+        StudyError: a waypoint that cannot be carried, values that are not finite.
+    """
+    judgement = Judgement(pair, registration, radius_mm)
+    return {
+        name: np.atleast_1d(np.asarray(metric.measure(judgement), dtype=np.float64))
+        for name, metric in METRICS.items()
+        if pair.has_truth or not metric.needs_truth
+    }

@@ -1,0 +1,51 @@
+"""Every format read and written, and the one atomic writer."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from study.files.clouds import read_ply, read_waypoints, write_ply, write_registration
+    from study.files.landmarks import read_landmarks
+    from study.files.plus import read_plus
+    from study.files.plus_write import write_plus
+    from study.files.sweep_folder import read_folder, write_folder
+    from study.files.volumes import read_labels, read_masks, read_volume, write_volume
+
+__all__ = [
+    "read_folder",
+    "read_labels",
+    "read_landmarks",
+    "read_masks",
+    "read_plus",
+    "read_ply",
+    "read_volume",
+    "read_waypoints",
+    "write_folder",
+    "write_plus",
+    "write_ply",
+    "write_registration",
+    "write_volume",
+]
+
+_HOMES = {
+    "read_folder": "sweep_folder",
+    "read_labels": "volumes",
+    "read_landmarks": "landmarks",
+    "read_masks": "volumes",
+    "read_plus": "plus",
+    "read_ply": "clouds",
+    "read_volume": "volumes",
+    "read_waypoints": "clouds",
+    "write_folder": "sweep_folder",
+    "write_plus": "plus_write",
+    "write_ply": "clouds",
+    "write_registration": "clouds",
+    "write_volume": "volumes",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a reader's module when it is first asked for: who only writes a text does not wait for SimpleITK."""
+    if name in _HOMES:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,143 @@
+"""What a registration is, what a method must offer, and path transfer from CT to US (sec. III-D)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from study import preview
+from study.errors import StudyError
+from study.geometry.points import fit_rigid
+from study.types import Floats, PointCloud, RigidTransform, as_points
+
+MIN_SUPPORT = 3  # points that hold a rigid motion
+MIN_WIDTH_MM = 1e-6  # second singular value of points that lie on a line but for rounding
+
+
+def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radius_mm: float = 20.0) -> Floats:
+    """Move each waypoint by the rigid fit of the cloud points around it (sec. III-D).
+
+    Args:
+        source: (n, 3) mm, CT.
+        warped: (n, 3) mm, row i is ``source[i]`` in the US frame.
+        waypoints: (k, 3) mm, CT.
+        radius_mm: sphere around each waypoint; 20 mm in the paper.
+
+    Returns:
+        (k, 3) mm in the US frame.
+
+    Raises:
+        StudyError: clouds that do not pair, or a sphere with fewer than 3 points or with points on a line.
+
+    A breath lifts this wall by 5 mm and widens it by 2 %; a waypoint behind it goes along:
+
+        >>> import numpy as np
+        >>> wall = np.random.default_rng(0).uniform([-60, -5, -60], [60, 5, 60], (2000, 3))
+        >>> transfer(wall, wall * [1.02, 1, 1] + [0, 5, 0], [[50, -10, 20]]).round(1)
+        array([[51., -5., 20.]])
+    """
+    waypoints = as_points(waypoints, "waypoints")
+    source, warped = as_points(source, "source"), as_points(warped, "warped")
+    if source.shape != warped.shape:
+        raise StudyError(
+            f"expected one warped point per source point, got {source.shape} and {warped.shape}; "
+            "pass both clouds of one registration"
+        )
+    if not radius_mm > 0:
+        raise StudyError(f"expected radius_mm > 0, got {radius_mm}; the paper's is 20")
+    moved = np.empty_like(waypoints)
+    for k, members in enumerate(KDTree(source).query_ball_point(waypoints, radius_mm)):
+        local = source[members]
+        if len(members) < MIN_SUPPORT or _on_a_line(local):
+            raise StudyError(
+                f"waypoint {k}: expected at least {MIN_SUPPORT} CT points off a line within {radius_mm:g} mm, "
+                f"got {len(members)}; check that it lies between the cartilages, or raise radius_mm"
+            )
+        moved[k] = fit_rigid(local, warped[members]).apply(waypoints[k : k + 1])[0]
+    return moved
+
+
+def _on_a_line(points: Floats) -> bool:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] < MIN_WIDTH_MM)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What every method returns; a method that has more to show returns a subclass.
+
+    Attributes:
+        source: (n, 3) mm, the CT points as given.
+        warped: (n, 3) mm, row i is ``source[i]`` in the target (US) frame.
+        T_us_ct: the rigid part: the whole answer of a rigid method, the coarse alignment of a non-rigid one.
+        converged: False when the iteration limit or the end of a schedule came before the method was at rest.
+        n_iterations: iterations (epochs) run.
+        stop_reason: why it stopped, in words.
+        history: figures of progress, in order; what they are and how often depends on the method.
+        seconds: wall time of the method; `study.pipeline.run_method` sets it, and
+        method: the name it ran under.
+        warnings: what a careful reader should know about this result.
+
+    A notebook shows one as a few lines and a picture. Its verb is path transfer:
+
+        >>> import numpy as np
+        >>> from study.types import RigidTransform
+        >>> wall = np.random.default_rng(0).uniform([-60, -5, -60], [60, 5, 60], (2000, 3))
+        >>> up = RigidTransform(np.eye(3), np.array([0.0, 5.0, 0.0]))
+        >>> pair = Registration(wall, up.apply(wall), up, converged=True, n_iterations=1, stop_reason="planted")
+        >>> pair.transfer([[50, -10, 20]]).round(1)
+        array([[50., -5., 20.]])
+    """
+
+    source: Floats
+    warped: Floats
+    T_us_ct: RigidTransform
+    converged: bool
+    n_iterations: int
+    stop_reason: str
+    history: tuple[float, ...] = ()
+    seconds: float = 0.0
+    method: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
+        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits (sec. III-D).
+
+        Raises:
+            StudyError: fewer than 3 cloud points within ``radius_mm`` of a waypoint.
+        """
+        return transfer(self.source, self.warped, waypoints, radius_mm=radius_mm)
+
+    def _repr_html_(self) -> str:
+        """A few lines, and the warped cloud coloured by how far each point left the rigid part."""
+        bent_mm = np.linalg.norm(self.warped - self.T_us_ct.apply(self.source), axis=1)
+        lines = {
+            "points": f"{len(self.source):,}",
+            "converged": "yes" if self.converged else "no",
+            "iterations": f"{self.n_iterations:,}",
+            "stopped": self.stop_reason,
+            "warnings": "; ".join(self.warnings) or "none",
+            "seconds": f"{self.seconds:.1f}",
+            "colour": f"distance from the rigid part, 0 to {bent_mm.max():.1f} mm",
+        }
+        return preview.card(f"Registration: {self.method or 'unnamed'}", lines, preview.by_size(self.warped, bent_mm))
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A registration method: a frozen dataclass of its parameters plus one verb.
+
+    It is its algorithm and no more: the clock, the one arithmetic thread, the name and the check of the result stand
+    once, around all of them, in `study.pipeline.run_method`.
+    """
+
+    name: ClassVar[str]
+    __dataclass_fields__: ClassVar[dict[str, Any]]  # a frozen dataclass: asdict(method) is its provenance
+
+    def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
+        """Register labelled, coarsely aligned clouds: ``warped`` row i is source point i in the target frame."""
+        ...

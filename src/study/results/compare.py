@@ -1,0 +1,120 @@
+"""A run against a reference: the same rows, every value within its metric's tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from study.errors import StudyError
+from study.evaluation.metrics import METRICS
+from study.results.metrics_csv import CASE, KEY, OK, read_metrics
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A run against a reference.
+
+    Attributes:
+        n_files: pairs of ``metrics.csv`` compared.
+        n_compared: rows found in both.
+        missing: keys of rows that only the reference has.
+        extra: keys of rows that only the candidate has.
+        differences: rows in both that differ by more than their tolerance or in status, largest multiple first;
+            columns as `KEY`, then ``reference``, ``candidate``, ``difference``, ``tolerance``, ``times_tolerance``.
+        largest: the largest difference of all compared rows as a multiple of its tolerance.
+    """
+
+    n_files: int
+    n_compared: int
+    missing: pd.DataFrame
+    extra: pd.DataFrame
+    differences: pd.DataFrame
+    largest: float
+
+    @property
+    def agrees(self) -> bool:
+        """Same rows, and every value within its tolerance."""
+        return not (len(self.missing) or len(self.extra) or len(self.differences))
+
+    @property
+    def exit_code(self) -> int:
+        """0 agrees, 1 differs; what cannot be compared raised a StudyError, which the command line makes 2."""
+        return 0 if self.agrees else 1
+
+    def report(self, n_largest: int = 10) -> str:
+        """What was compared, then what differs, the largest differences first."""
+        lines = [f"compared {self.n_compared} rows of {self.n_files} file(s)"]
+        for title, rows in (("only in the reference", self.missing), ("only in the candidate", self.extra)):
+            if len(rows):
+                lines += [f"{len(rows)} row(s) {title}:", *_listed(rows, n_largest)]
+        if len(self.differences):
+            lines += [f"{len(self.differences)} value(s) beyond tolerance:", *_listed(self.differences, n_largest)]
+        used = f"largest difference {self.largest:.3g} of its tolerance"
+        return "\n".join([*lines, f"agrees; {used}" if self.agrees else "differs"])
+
+
+def _listed(rows: pd.DataFrame, n: int) -> list[str]:
+    shown = rows.head(n).to_string(index=False).splitlines()
+    return [f"  {line}" for line in shown] + ([f"  ... and {len(rows) - n} more"] if len(rows) > n else [])
+
+
+def compare(reference: Path, candidate: Path) -> Comparison:
+    """Compare a run with a reference: the same rows, then each value within its metric's tolerance.
+
+    Args:
+        reference: a folder with ``metrics.csv``, or with one such folder per dataset.
+        candidate: the same layout.
+
+    Raises:
+        StudyError: what cannot be compared: a file that is missing, empty, unreadable or of another schema, in the
+            reference or the candidate.
+    """
+    names = _metrics_files(reference)
+    if not names:
+        raise StudyError(f"expected metrics.csv in {reference} or in its folders, got none; check the path")
+    found = _metrics_files(candidate)
+    lacking, unknown = sorted(set(names) - set(found)), sorted(set(found) - set(names))
+    if lacking or unknown:
+        raise StudyError(
+            f"expected the same metrics.csv files in both folders, got {_names(lacking)} only in {reference} and "
+            f"{_names(unknown)} only in {candidate}; run the same datasets"
+        )
+    tables = [(read_metrics(reference / name), read_metrics(candidate / name)) for name in names]
+    theirs, ours = (pd.concat(column, ignore_index=True) for column in zip(*tables, strict=True))
+    return _compare(theirs, ours, len(names))
+
+
+def _names(paths: list[Path]) -> str:
+    return ", ".join(path.as_posix() for path in paths) or "nothing"
+
+
+def _metrics_files(folder: Path) -> list[Path]:
+    if (folder / "metrics.csv").is_file():
+        return [Path("metrics.csv")]
+    return sorted(path.relative_to(folder) for path in folder.glob("*/metrics.csv"))
+
+
+def _compare(reference: pd.DataFrame, candidate: pd.DataFrame, n_files: int) -> Comparison:
+    keys = list(KEY)
+    both = reference.merge(candidate, on=keys, how="outer", suffixes=("_r", "_c"), indicator="where")
+    shared = both[both["where"] == "both"]
+    # A case that failed in both agrees, whatever the words of the reason; a case that failed in one lacks rows.
+    shared = shared[shared["metric"] != CASE].copy()
+    shared["tolerance"] = shared["metric"].map({name: metric.tolerance for name, metric in METRICS.items()})
+    shared["difference"] = (shared["value_c"] - shared["value_r"]).abs()
+    shared["times_tolerance"] = shared["difference"] / shared["tolerance"]
+    changed = (shared["times_tolerance"] > 1) | (shared["status_r"] != shared["status_c"])
+    differences = shared[changed].sort_values("times_tolerance", ascending=False, kind="stable")
+    for side, name in (("r", "reference"), ("c", "candidate")):
+        pairs = zip(differences[f"value_{side}"], differences[f"status_{side}"], strict=True)
+        differences[name] = [f"{value!r}" + ("" if status == OK else f" ({status})") for value, status in pairs]
+    return Comparison(
+        n_files=n_files,
+        n_compared=int((both["where"] == "both").sum()),
+        missing=both.loc[both["where"] == "left_only", keys],
+        extra=both.loc[both["where"] == "right_only", keys],
+        differences=differences[[*keys, "reference", "candidate", "difference", "tolerance", "times_tolerance"]],
+        largest=float(shared["times_tolerance"].max()) if len(shared) else 0.0,
+    )

@@ -1,0 +1,37 @@
+"""Tracked ultrasound (sec. II): calibrations, masks to cloud; the virtual sweep and the sizes of its errors."""
+
+from study.ultrasound.cloud import SweepCloud, SweepReport, contour_points, sweep_cloud, thin_evenly, upper_contour
+from study.ultrasound.probe import Probe
+from study.ultrasound.spatial import SpatialCalibration, calibrate_spatial
+from study.ultrasound.sweep_errors import ERROR_SOURCES, LATENCY_S, SweepErrors, budget_cases, error_table
+from study.ultrasound.temporal import LatencyCalibration, calibrate_latency
+from study.ultrasound.tracked import TrackedSweep
+from study.ultrasound.virtual_calibration import simulate_calibration_views, simulate_latency_run
+from study.ultrasound.virtual_sweep import simulate_sweep
+from study.ultrasound.visible import true_parts, visible_mesh, visible_surface
+
+__all__ = [
+    "ERROR_SOURCES",
+    "LATENCY_S",
+    "LatencyCalibration",
+    "Probe",
+    "SpatialCalibration",
+    "SweepCloud",
+    "SweepErrors",
+    "SweepReport",
+    "TrackedSweep",
+    "budget_cases",
+    "calibrate_latency",
+    "calibrate_spatial",
+    "contour_points",
+    "error_table",
+    "simulate_calibration_views",
+    "simulate_latency_run",
+    "simulate_sweep",
+    "sweep_cloud",
+    "thin_evenly",
+    "true_parts",
+    "upper_contour",
+    "visible_mesh",
+    "visible_surface",
+]

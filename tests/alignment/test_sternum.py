@@ -1,0 +1,99 @@
+"""Eq. 1: the rectangle is found where it was planted, whatever lies around it."""
+
+import numpy as np
+import pytest
+
+from study.alignment.sternum import SternumParams, feature_plane, rectangle_mask, sternum_candidates, symmetry_axis
+from study.errors import StudyError
+from study.types import PointCloud, RigidTransform
+
+
+def turned(points: np.ndarray, angle_deg: float) -> np.ndarray:
+    """Counter-clockwise in the plane."""
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return points @ np.array([[c, s], [-s, c]])
+
+
+def drawing(rng: np.random.Generator) -> np.ndarray:
+    """A 30 × 90 mm plate and four thin bars a side, upright around the origin, (n, 2) mm."""
+    plate = rng.uniform([-15, -45], [15, 45], (3000, 2))
+    bars = [
+        np.column_stack([side * rng.uniform(15, 60, 250), row + rng.uniform(-5, 5, 250)])
+        for side in (-1, 1)
+        for row in (-38, -14, 12, 38)
+    ]
+    return np.concatenate([plate, *bars])
+
+
+def test_the_defaults_are_the_papers():
+    params = SternumParams()
+    assert (params.width_mm, params.height_mm) == (30, 90)
+    assert params.scales_mm == (5, 3, 2)
+    assert params.steps_deg == (10, 2, 1)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 37.0, -68.0, 90.0])
+def test_the_planted_rectangle_is_found(angle_deg):
+    centre = np.array([123.0, -45.0])
+    points = turned(drawing(np.random.default_rng(0)), angle_deg) + centre
+    fit = next(sternum_candidates(points))
+    assert fit.overlap > 0.95
+    # Two pixels of the last scale across; along, the bars at the ends leave the rectangle a little play.
+    assert np.linalg.norm(fit.centre - centre) < 4.0
+    assert abs((fit.angle_deg - angle_deg + 90) % 180 - 90) <= 3.0  # a rectangle is its own half turn
+
+
+def test_the_best_candidate_comes_first_and_none_twice():
+    fits = list(sternum_candidates(drawing(np.random.default_rng(0))))
+    assert len(fits) > 1
+    # Candidates come in the order of the coarse scale: a finer one may overtake, by a pixel's rounding.
+    assert fits[0].overlap == max(fit.overlap for fit in fits)
+    for i, one in enumerate(fits):
+        for other in fits[:i]:
+            apart = np.linalg.norm(one.centre - other.centre)
+            assert apart > 5 or abs((one.angle_deg - other.angle_deg + 90) % 180 - 90) > 3
+
+
+def test_thin_bars_alone_cover_no_sternum():
+    points = drawing(np.random.default_rng(0))
+    bars = points[np.abs(points[:, 0]) > 15]
+    assert max(fit.overlap for fit in sternum_candidates(bars)) < SternumParams().min_overlap
+
+
+def test_a_rectangle_has_one_area_at_every_angle_and_turns_counter_clockwise():
+    for pixel_mm in (5.0, 3.0, 2.0):
+        areas = [rectangle_mask(30, 90, pixel_mm, angle).sum() * pixel_mm**2 for angle in range(-90, 90, 10)]
+        assert areas == pytest.approx([2700] * 18, rel=0.05)  # five sub-pixels of 1 mm along 30 mm round by that
+    upright, half = rectangle_mask(30, 90, 2.0, 0), rectangle_mask(30, 90, 2.0, 30)
+    assert np.flatnonzero(upright.any(axis=0)).size > 2 * np.flatnonzero(upright.any(axis=1)).size  # long along y
+    where = np.argwhere(half > 0.5) - (len(half) - 1) / 2
+    assert (where[:, 0] * where[:, 1]).sum() < 0  # its top leans to -x
+
+
+@pytest.mark.parametrize(("angle_deg", "shift_mm"), [(0.0, 0.0), (11.0, 4.0), (-17.0, -6.0)])
+def test_the_symmetry_axis_of_a_planted_symmetric_drawing(angle_deg, shift_mm):
+    half = drawing(np.random.default_rng(1))
+    half = half[half[:, 0] > 0]
+    whole = np.concatenate([half, half * [-1, 1]]) + np.array([shift_mm, 0])
+    angle, shift = symmetry_axis(turned(whole, angle_deg))
+    assert angle == pytest.approx(angle_deg, abs=3.0)  # bars without texture leave it that much play
+    assert shift == pytest.approx(shift_mm, abs=2.0)  # one pixel
+
+
+def test_the_feature_plane_is_a_proper_motion_onto_the_wall(ct_clouds):
+    cloud = ct_clouds["ct1"]
+    motion = RigidTransform.random(np.random.default_rng(0))
+    plane = feature_plane(cloud)
+    assert np.linalg.det(plane.rotation) == pytest.approx(1)
+    spread = plane.inverse.apply(cloud.points).std(axis=0)
+    assert spread[0] > spread[1] > spread[2]
+    assert abs(plane.rotation[1, 2]) > 0.8  # its normal is nearly antero-posterior
+    moved = feature_plane(cloud.moved(motion))
+    assert moved.matrix == pytest.approx((motion @ plane).matrix, abs=1e-6)
+
+
+def test_what_spreads_over_no_plane_is_refused():
+    rng = np.random.default_rng(2)
+    for points in (rng.normal(scale=40, size=(500, 3)), rng.normal(size=(500, 3)) * [60, 2, 1]):
+        with pytest.raises(StudyError, match="expected a chest wall spread over a plane, got principal spreads"):
+            feature_plane(PointCloud(points))

@@ -1,0 +1,59 @@
+"""Methods and rib levels look the same everywhere; a method that is not listed has a style too."""
+
+from __future__ import annotations
+
+import numpy as np
+from figure_data import METHODS, metrics, texts
+from matplotlib.colors import to_rgb
+
+from study import figures
+from study.types import Part
+
+
+def test_methods_keep_their_colour_and_tuned_ones_are_solid() -> None:
+    for name in METHODS:
+        shipped, tuned = figures.method_style(name), figures.method_style(f"{name}_tuned")
+        assert shipped.colour == tuned.colour
+        assert shipped.hatch
+        assert not tuned.hatch
+        assert sum(shipped.face) > sum(tuned.face)
+    assert len({figures.METHOD_STYLE[name].colour for name in METHODS}) == len(METHODS)
+    assert len({figures.METHOD_STYLE[name].marker for name in METHODS}) == len(METHODS)
+
+
+def test_a_new_method_needs_no_entry_here() -> None:
+    style = figures.method_style("bayesian_cpd")
+    assert style == figures.MethodStyle("bayesian cpd", "#33BBEE", "P", tuned=False)  # by its name, on every machine
+    assert figures.method_style("bayesian_cpd_tuned") == figures.MethodStyle(
+        "bayesian cpd, tuned", style.colour, style.marker, tuned=True
+    )
+
+
+def test_a_new_method_looks_like_no_listed_one() -> None:
+    new = [figures.method_style(f"method_{k}") for k in range(200)]
+    listed = figures.METHOD_STYLE.values()
+    assert not {style.colour for style in new} & {style.colour for style in listed}
+    assert not {style.marker for style in new} & {style.marker for style in listed}
+    assert len({(style.colour, style.marker) for style in new}) == 16  # all of them are used
+
+
+def test_new_methods_are_drawn_among_the_others_and_named() -> None:
+    methods = (*METHODS, "bayesian_cpd", "bayesian_cpd_tuned")
+    figure = figures.hd_bars(metrics(methods))
+    assert "bayesian cpd, tuned" in texts(figure)
+    edges = {tuple(bar.get_edgecolor()[:3]) for bar in figure.axes[0].patches}
+    assert to_rgb(figures.method_style("bayesian_cpd").colour) in edges
+
+
+def test_order_of_methods_does_not_depend_on_their_order_in_the_table() -> None:
+    given = ("zeta", "truth", "skeleton_graph", "cpd", "alpha", "icp_tuned", "icp", "cpd")
+    wanted = ["icp", "icp_tuned", "cpd", "skeleton_graph", "alpha", "zeta", "truth"]
+    assert figures.in_order(given) == figures.in_order(given[::-1]) == wanted
+
+
+def test_levels_share_a_hue_and_the_left_is_lighter() -> None:
+    for level in (2, 3, 4, 5):
+        right, left = (np.array(figures.PART_COLOUR[Part.cartilage(side, level)]) for side in ("right", "left"))
+        assert (left >= right).all()
+        assert left.sum() > right.sum() + 0.3
+    assert len(set(figures.PART_COLOUR[Part.STERNUM])) == 1  # neutral

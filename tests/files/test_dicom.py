@@ -1,0 +1,65 @@
+"""A DICOM series is one image, or is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from stored_images import LPS_TO_RAS, MARKED, SIZE, SPACING, marked_mm, stored_image
+
+from study.errors import StudyError
+from study.files.volumes import read_volume
+
+
+def write_series(folder: Path, shift_mm: float = 0.0, skip: int | None = None, uid: str = "1.2.3") -> sitk.Image:
+    folder.mkdir(exist_ok=True)
+    image = stored_image()
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for k in range(SIZE[2]):
+        if k == skip:
+            continue
+        one = image[:, :, k]
+        x, y, z = image.TransformIndexToPhysicalPoint((0, 0, k))
+        for tag, value in {
+            "0008|0060": "CT",
+            "0020|000e": uid,
+            "0020|000d": "1.2.4",
+            "0008|0018": f"{uid}.{k + 1}",
+            "0020|0013": str(k),
+            "0020|0032": f"{x}\\{y + shift_mm * k}\\{z}",
+            "0020|0037": "1\\0\\0\\0\\1\\0",
+            "0028|0030": f"{SPACING[1]}\\{SPACING[0]}",
+            "0028|1052": "0",
+            "0028|1053": "1",
+        }.items():
+            one.SetMetaData(tag, value)
+        writer.SetFileName(str(folder / f"{uid}-{SIZE[2] - k}.dcm"))  # names against the order of the slices
+        writer.Execute(one)
+    return image
+
+
+def test_dicom_series_is_sorted_by_position(tmp_path: Path) -> None:
+    image = write_series(tmp_path / "series")
+    volume = read_volume(tmp_path / "series")
+    expected = np.array(image.TransformIndexToPhysicalPoint(MARKED)) * LPS_TO_RAS
+    np.testing.assert_allclose(marked_mm(volume), expected, atol=1e-3)
+    np.testing.assert_allclose(volume.spacing_mm, SPACING, atol=1e-6)
+
+
+def test_faulty_dicom_series_are_refused(tmp_path: Path) -> None:
+    write_series(tmp_path / "tilted", shift_mm=0.4)
+    with pytest.raises(StudyError, match=r"gantry tilt of 9\.1 degrees"):
+        read_volume(tmp_path / "tilted")
+    write_series(tmp_path / "gap", skip=2)
+    with pytest.raises(StudyError, match="slices are missing"):
+        read_volume(tmp_path / "gap")
+    write_series(tmp_path / "two", uid="1.2.3")
+    write_series(tmp_path / "two", uid="1.2.9")
+    with pytest.raises(StudyError, match="one DICOM series, got 2"):
+        read_volume(tmp_path / "two")
+    (tmp_path / "none").mkdir()
+    with pytest.raises(StudyError, match="expected a DICOM series"):
+        read_volume(tmp_path / "none")

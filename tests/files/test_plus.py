@@ -1,0 +1,194 @@
+"""Metafiles of this and other programs are read, and damaged ones say what is wrong."""
+
+import dataclasses
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from tracked_sweeps import assert_identical, make_sweep
+
+from study.errors import StudyError
+from study.files.plus import read_plus
+from study.files.plus_write import write_plus
+from study.types import RigidTransform
+
+REAL = Path(__file__).parents[3] / "shared" / "data" / "plus" / "BoneUltrasound_L14.igs.mha"
+
+
+def foreign(path: Path, *, pixels=None, drop=(), **changes) -> Path:
+    """A small PLUS file as another program writes it: two 3 x 2 frames."""
+    fields = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "CompressedData": "False",
+        "DimSize": "3 2 2",
+        "ElementNumberOfChannels": "1",
+        "ElementType": "MET_UCHAR",
+        "UltrasoundImageOrientation": "MF",
+        "UltrasoundImageType": "BRIGHTNESS",
+    }
+    for i in range(2):
+        fields |= {
+            f"Seq_Frame{i:04d}_ProbeToTrackerTransform": f"1 0 0 {i} 0 1 0 0 0 0 1 7 0 0 0 1",
+            f"Seq_Frame{i:04d}_ProbeToTrackerTransformStatus": "OK",
+            f"Seq_Frame{i:04d}_ReferenceToTrackerTransform": "0 -1 0 0 1 0 0 5 0 0 1 0 0 0 0 1",
+            f"Seq_Frame{i:04d}_ReferenceToTrackerTransformStatus": "OK",
+            f"Seq_Frame{i:04d}_Timestamp": f"{10 + i}",
+            f"Seq_Frame{i:04d}_ImageStatus": "OK",
+        }
+    fields |= changes
+    lines = [f"{key} = {value}" for key, value in fields.items() if key not in drop and value is not None]
+    data = bytes(range(12)) if pixels is None else pixels
+    path.write_bytes("\n".join([*lines, "ElementDataFile = LOCAL\n"]).encode() + data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("orientation", "expected"),
+    [
+        ("MF", [[0, 1, 2], [3, 4, 5]]),
+        ("UF", [[2, 1, 0], [5, 4, 3]]),
+        ("MN", [[3, 4, 5], [0, 1, 2]]),
+        ("UNA", [[5, 4, 3], [2, 1, 0]]),
+        ("FM", [[0, 3], [1, 4], [2, 5]]),
+        ("NU", [[5, 2], [4, 1], [3, 0]]),
+    ],
+)
+def test_images_are_turned_to_mf(tmp_path, orientation, expected):
+    sweep = read_plus(foreign(tmp_path / "a.igs.mha", UltrasoundImageOrientation=orientation))
+    np.testing.assert_array_equal(sweep.images[0], expected)
+
+
+def test_foreign_poses_bases_and_calibration(tmp_path):
+    calibrated = {f"Seq_Frame{i:04d}_ImageToProbeTransform": "0 -0.3 0 4 0.2 0 0 5 0 0 0.2 6 0 0 0 1" for i in range(2)}
+    path = foreign(tmp_path / "a.igs.mha", **calibrated, Seq_Frame0001_ProbeToTrackerTransformStatus="INVALID")
+    sweep = read_plus(path)
+    np.testing.assert_array_equal(sweep.poses[0, :3, 3], [0, 0, 7])
+    assert list(sweep.pose_valid) == [True, False]
+    assert sweep.latency_s == 0
+    np.testing.assert_allclose(sweep.pixel_spacing_mm, (0.2, 0.3))
+    np.testing.assert_allclose(sweep.T_probe_image.rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_array_equal(sweep.T_probe_image.translation, [4, 5, 6])
+    # In the reference's frame: inv([[0,-1,0],[1,0,0],[0,0,1]], t = (0,5,0)) applied to (0, 0, 7).
+    np.testing.assert_allclose(read_plus(path, base="Reference").poses[0, :3, 3], [-5, 0, 7], atol=1e-12)
+    own = read_plus(path, pixel_spacing_mm=(1, 1), T_probe_image=RigidTransform(), latency_s=0.1)
+    assert (own.pixel_spacing_mm, own.latency_s) == ((1, 1), 0.1)
+
+
+def test_a_frame_without_an_image_keeps_its_pose(tmp_path):
+    sweep = read_plus(foreign(tmp_path / "a.igs.mha", Seq_Frame0000_ImageStatus="INVALID"))
+    assert sweep.n_frames == 1
+    assert len(sweep.poses) == 2
+    np.testing.assert_array_equal(sweep.images[0], [[6, 7, 8], [9, 10, 11]])
+
+
+def test_big_endian_pixels(tmp_path):
+    data = np.arange(12, dtype=">i2").tobytes()
+    path = foreign(tmp_path / "a.igs.mha", pixels=data, ElementType="MET_SHORT", BinaryDataByteOrderMSB="True")
+    np.testing.assert_array_equal(read_plus(path).images.ravel(), np.arange(12))
+
+
+ZIPPED = {"CompressedData": "True"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pixels": bytes(5)}, "truncated"),
+        ({"pixels": bytes(13)}, "DimSize wrong"),
+        ({"DimSize": "3 2"}, "columns, rows and frames"),
+        ({"DimSize": "3 2 -2"}, "columns, rows and frames"),
+        ({"DimSize": "3 2 1", "pixels": bytes(6)}, "mis-sized"),
+        ({"drop": ("DimSize",)}, "columns, rows and frames"),
+        ({"ElementType": "MET_DOUBLE"}, "ElementType"),
+        ({"ElementNumberOfChannels": "3"}, "one channel"),
+        ({"UltrasoundImageOrientation": "XX"}, "UltrasoundImageOrientation"),
+        ({"drop": ("ObjectType",)}, "ObjectType first"),
+        ({"drop": ("Seq_Frame0001_Timestamp",)}, "frame 1: expected a field Timestamp"),
+        ({"Seq_Frame0001_Timestamp": "soon"}, "1 numbers as Timestamp"),
+        ({"Seq_Frame0001_Timestamp": "9"}, "rising"),
+        ({"Seq_Frame0001_ProbeToTrackerTransform": "1 0 0"}, "frame 1: expected 16 numbers"),
+        ({"Seq_Frame0001_ProbeToTrackerTransform": "2 " * 16}, "proper rotations"),
+        (
+            {f"Seq_Frame{i:04d}_ProbeToTrackerTransform": None for i in range(2)},
+            "pose ProbeToTrackerTransform per frame, got ReferenceToTrackerTransform",
+        ),
+        ({f"Seq_Frame{i:04d}_ProbeToTrackerTransformStatus": "INVALID" for i in range(2)}, "valid poses"),
+        ({"Seq_Frame0000_ImageToProbeTransform": "1 1 0 0 0 0.1 0 0 0 0 1 0 0 0 0 1"}, "square axes"),
+        ({**ZIPPED, "CompressedDataSize": "99", "pixels": zlib.compress(bytes(12))}, "99 compressed bytes"),
+        ({**ZIPPED, "pixels": zlib.compress(bytes(12))[:-8]}, "truncated|damaged"),
+        ({**ZIPPED, "pixels": b"not deflated"}, "damaged"),
+        ({**ZIPPED, "pixels": zlib.compress(bytes(11))}, "DimSize"),
+        ({**ZIPPED, "pixels": zlib.compress(bytes(13))}, "got more"),
+        ({**ZIPPED, "DimSize": "99999 99999 2", "pixels": zlib.compress(bytes(12))}, "cannot hold"),
+    ],
+)
+def test_damaged_files_say_what_is_wrong(tmp_path, changes, message):
+    with pytest.raises(StudyError, match=message) as caught:
+        read_plus(foreign(tmp_path / "bad.igs.mha", **changes))
+    assert len(str(caught.value)) < 400
+
+
+def test_a_bomb_is_not_inflated(tmp_path):
+    path = foreign(tmp_path / "bomb.igs.mha", **ZIPPED, pixels=zlib.compress(bytes(100_000_000), 9))
+    tracemalloc.start()
+    with pytest.raises(StudyError, match="got more"):
+        read_plus(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5_000_000
+
+
+def test_other_files_are_refused(tmp_path):
+    path = tmp_path / "a.igs.mha"
+    with pytest.raises(StudyError, match="nothing at"):
+        read_plus(path)
+    for content in (b"", b"\x89PNG\r\n\x1a\n" * 99, b"x" * 200_000, b"ObjectType = Image\nNDims = 3\n"):
+        path.write_bytes(content)
+        with pytest.raises(StudyError, match="truncated or not a PLUS"):
+            read_plus(path)
+    write_plus(path, make_sweep())
+    whole = path.read_bytes()
+    for cut in np.linspace(1, len(whole) - 1, 25).astype(int):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(StudyError):
+            read_plus(path)
+
+
+def test_the_real_plus_file():
+    if not REAL.exists():
+        pytest.skip(f"no PLUS example at {REAL}: it is not part of the repository (PlusLibData, BSD-3)")
+    sweep = read_plus(REAL)
+    assert sweep.images.shape == (21, 616, 820)
+    assert sweep.images.dtype == np.uint8
+    np.testing.assert_array_equal(sweep.images, sitk.GetArrayFromImage(sitk.ReadImage(str(REAL))))
+    assert sweep.pose_valid.all()
+    assert len(sweep.poses) == 21
+    np.testing.assert_array_equal(sweep.poses[0, 0], [0.853646, -0.501315, 0.141319, 257.956])
+    assert sweep.frame_times_s[0] == 232.542071
+    assert sweep.frame_poses()[2].all()
+    assert sweep.masks is None
+    # The same in the frame of the reference that was fixed to the patient.
+    T_tracker_reference = np.array(
+        [
+            [-0.61495, 0.0616122, -0.786156, 307.759],
+            [-0.148385, -0.988175, 0.0386253, -88.1807],
+            [-0.77448, 0.140406, 0.61682, -54.9176],
+            [0, 0, 0, 1],
+        ]
+    )
+    np.testing.assert_allclose(T_tracker_reference @ read_plus(REAL, base="Reference").poses[0], sweep.poses[0])
+    with pytest.raises(StudyError, match="got ProbeToTrackerTransform, ReferenceToTracker"):
+        read_plus(REAL, probe="Needle")
+
+
+def test_the_real_file_written_reads_back(tmp_path):
+    if not REAL.exists():
+        pytest.skip(f"no PLUS example at {REAL}: it is not part of the repository (PlusLibData, BSD-3)")
+    sweep = read_plus(REAL)
+    short = dataclasses.replace(sweep, frame_times_s=sweep.frame_times_s[:3], images=sweep.images[:3])
+    write_plus(tmp_path / "b.igs.mha", short)
+    assert_identical(read_plus(tmp_path / "b.igs.mha"), short)
