@@ -222,7 +222,7 @@ costs["in space"].rename_axis("in space (mm)").style.format("{:.2f}")
 
 # %%
 print(f"the coarse alignment refused {len(budget.refused)} of {REPEATS[profile] * len(cases)} sweeps")
-budget.refused.groupby("source", sort=False).agg(sweeps=("sweep", "size"), reason=("reason", "first"))
+budget.refused.groupby("error", sort=False).agg(sweeps=("sweep", "size"), reason=("reason", "first"))
 
 # %% [markdown]
 # ## What this shows
@@ -238,14 +238,14 @@ assert off.angle_deg < 0.3, f"expected the image within 0.3° of its place, got 
 distance = table["cloud to surface (mm)"]
 assert distance["none"] < 0.2, f"a sweep without errors must lie within a pixel of the surface, got {distance['none']}"
 assert distance["all"] < 1.5, f"all errors together must stay below half a cartilage, got {distance['all']} mm"
-assert distance["latency"] == distance[budget.sources[1:-2]].max(), "a latency left in must be the worst single error"
+assert distance["latency"] == distance[budget.errors[1:-2]].max(), "a latency left in must be the worst single error"
 lag_mm = probe.speed_mm_s * ultrasound.LATENCY_S
 moved_mm = table["points moved (mm)"]["latency"]
 # The hand strays a little and stops at each turn, so its mean speed is not quite the nominal one.
 assert abs(moved_mm - lag_mm) < 0.1 * lag_mm, (
     f"expected a shift of speed times lag, {lag_mm:.2f} mm, got {moved_mm:.2f}"
 )
-usual = budget.refused[~budget.refused["source"].isin(["latency", "all, latency not corrected"])]
+usual = budget.refused[~budget.refused["error"].isin(["latency", "all, latency not corrected"])]
 assert usual.empty, f"the coarse alignment must take a sweep with ordinary errors:\n{usual}"
 graph = costs["in the plane"][labels["skeleton_graph"]]
 assert graph["all, latency not corrected"] > graph["all"], "a latency left in must cost the waypoints something"

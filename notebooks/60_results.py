@@ -69,7 +69,7 @@ def overview(metric, paper):
     title = f"{evaluation.METRICS[metric].title} ({evaluation.METRICS[metric].unit})"
     cells = {name: run.summary().loc[title] for name, run in runs.items()}
     cells["paper, other data"] = paper.apply(lambda row: f"{row['mean']:.2f} ± {row['sd']:.2f} (n={row['n']})", axis=1)
-    methods = results.in_order(name for run in runs.values() for name in run.methods)
+    methods = evaluation.in_order(name for run in runs.values() for name in run.methods)
     return pd.DataFrame(cells).reindex(methods).fillna("–").rename_axis(title)
 
 
@@ -101,7 +101,7 @@ display(*drawn.values())
 
 
 # %%
-variants = [name for name in results.in_order(per_pair[dataset].columns) if name.startswith(GRAPH)]
+variants = [name for name in evaluation.in_order(per_pair[dataset].columns) if name.startswith(GRAPH)]
 tested = ("hd", "waypoint_error", "true_waypoint_error_inplane")
 tests = pd.concat(
     [evaluation.paired_tests(methods_only, metric, name) for name in variants for metric in tested], ignore_index=True
@@ -181,7 +181,7 @@ timed = {
     name: run.timings[run.timings["stage"] == "register"].groupby("method")["seconds"].mean()
     for name, run in runs.items()
 }
-pd.DataFrame(timed).reindex(results.in_order(methods_only[dataset].columns)).round(1)
+pd.DataFrame(timed).reindex(evaluation.in_order(methods_only[dataset].columns)).round(1)
 
 # %% [markdown]
 # ## Against the committed reference

@@ -201,10 +201,18 @@ def test_the_planted_source_is_read_once(monkeypatch: pytest.MonkeyPatch) -> Non
 # --- workers and tables ----------------------------------------------------------------------------------------------
 
 
-def half(number: int) -> float:
-    if number % 2:
-        raise StudyError(f"expected an even number, got {number}")
-    return number / 2
+def halving() -> Callable[[int], float]:
+    """A local function: it travels to a worker by value, where this file is no module that could be imported."""
+
+    def half(number: int) -> float:
+        if number % 2:
+            raise StudyError(f"expected an even number, got {number}")
+        return number / 2
+
+    return half
+
+
+half = halving()
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])

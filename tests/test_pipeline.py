@@ -44,7 +44,9 @@ SLOW = ("open3d", "trimesh", "pycpd")
 def loaded(imports: str, *names: str) -> list[str]:
     """Which of ``names`` a fresh interpreter has after ``imports``."""
     code = f"import sys, {imports}; print(*[name for name in {names!r} if name in sys.modules])"
-    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    return subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, encoding="utf-8"
+    ).stdout.split()
 
 
 def test_importing_the_package_imports_no_method():

@@ -71,7 +71,7 @@ def test_the_check_runs_on_a_bare_python() -> None:
     done = subprocess.run(
         [sys.executable, "-S", "-I", str(ROOT / "tools" / "check_system.py")],
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         check=False,
     )
     assert done.returncode in (0, 2)

@@ -31,8 +31,10 @@ Run = Callable[..., str]
 
 def _outside(command: list[str], folder: Path, **variables: str) -> str:
     """Standard output of a command that works in ``folder`` and inherits no way to the checkout's modules."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")} | variables
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    environment |= {"PYTHONUTF8": "1"} | variables
+    # The library writes UTF-8; what a locale set by some other test's library would decode is no matter.
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, encoding="utf-8", timeout=300)
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 

@@ -13,20 +13,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from study import phantom
-from study.alignment.chest import Alignment, align
 from study.data.manifest import load_manifest
 from study.datasets.people import make_patient
 from study.datasets.phantoms import PhantomDataset
 from study.errors import StudyError
-from study.evaluation.distances import hausdorff_mm, point_errors_mm
+from study.evaluation.metrics import judge
+from study.evaluation.pair import Pair
 from study.methods.cpd import Cpd
 from study.methods.icp import Icp
 from study.methods.nonrigid_icp import NonrigidIcp, Stage
@@ -37,33 +36,24 @@ from study.pipeline import register_aligned
 from study.registration import Method
 from study.seeds import named_rng
 from study.skeleton.som import SomParams
-from study.types import Floats
 
 # Source subject and cohort seed; the target is its "patient".
 PAIRS = (("ct1", 101), ("ct2", 102), ("ct3", 103), ("ct4", 104), ("ct5", 105), ("ct1", 106))
 GRIDS = ("icp", "nonrigid_icp", "cpd", "skeleton_graph", "visible_surface")
-MEASURES = ("waypoint_error_mm", "waypoint_error_inplane_mm", "true_error_mm", "hd_mm", "converged")
+MEASURES = {  # column of the tables: metric
+    "waypoint_error_mm": "true_waypoint_error",
+    "waypoint_error_inplane_mm": "true_waypoint_error_inplane",
+    "true_error_mm": "true_error_mean",
+    "hd_mm": "hd",
+}
 
 
-@dataclass(frozen=True)
-class Case:
-    """A development pair, coarsely aligned, and where the CT's points and waypoints truly belong in the US frame."""
-
-    name: str
-    alignment: Alignment
-    truth: Floats
-    waypoints: Floats
-    true_waypoints: Floats
-
-
-def development_case(name: str, seed: int) -> Case:
+def development_pair(name: str, seed: int) -> Pair:
+    """A pair of the phantoms of one cohort seed, its sweep drawn by that seed; its source is ``ct1@101``."""
     params = find_profile("full")
     people = PhantomDataset("phantom", params, 0, load_manifest(), cohort_seed=seed)
-    atlas, patient = people.anatomy(name), people.anatomy("patient")
-    seen = make_patient(patient, params, seed)
-    drawn = [phantom.draw_subject(one, seed) for one in (name, "patient")]
-    there = [seen.T_us_ras.apply(phantom.truth_map(*drawn, p)) for p in (atlas.cloud.points, atlas.waypoints.points)]
-    return Case(f"{name}@{seed}", align(atlas.cloud, seen.cloud), there[0], atlas.waypoints.points, there[1])
+    patient = make_patient(people.anatomy("patient"), params, seed)
+    return replace(people.pair(people.anatomy(name), patient), source=f"{name}@{seed}")
 
 
 def scaled_steps(factor: float) -> tuple[Stage, ...]:
@@ -109,33 +99,24 @@ def grid(name: str) -> Iterator[Method]:
         raise SystemExit(f"expected one of {', '.join(GRIDS)}, got {name!r}")
 
 
-def run_grid(methods: Iterable[Method], cases: list[Case], *, whole_too: bool = False) -> pd.DataFrame:
-    """One row per setting and case: parameters, true errors of waypoints and points, Hausdorff distance, time."""
+def run_grid(methods: Iterable[Method], pairs: list[Pair], *, whole_too: bool = False) -> pd.DataFrame:
+    """One row per setting and pair: parameters, true errors of waypoints and points, Hausdorff distance, time."""
     rows: list[dict[str, Any]] = []
     for setting, method in enumerate(methods):
         runner = method if whole_too else VisibleSurface(method)
-        for case in cases:
-            row = {"setting": setting, "case": case.name, "name": label(method), **asdict(method)}  # type: ignore[call-overload]
-            target = case.alignment.target
-            normal = target.T_cloud_chest.rotation[:, 2]
+        for pair in pairs:
+            row = {"setting": setting, "case": pair.source, "name": label(method), **asdict(method)}  # type: ignore[call-overload]
             try:
-                result = register_aligned(case.alignment, runner, named_rng(0, case.name))
-                moved = result.transfer(case.waypoints)
-                row |= {
-                    "waypoint_error_mm": point_errors_mm(moved, case.true_waypoints).mean(),
-                    "waypoint_error_inplane_mm": point_errors_mm(moved, case.true_waypoints, normal).mean(),
-                    "true_error_mm": point_errors_mm(result.warped, case.truth).mean(),
-                    "hd_mm": hausdorff_mm(result.warped, target.cloud.points),
-                    "converged": result.converged,
-                    "n_iterations": result.n_iterations,
-                    "status": "ok",
-                }
+                result = register_aligned(pair.alignment, runner, named_rng(0, pair.source))
+                values = judge(pair, result)
+                row |= {measure: values[metric].mean() for measure, metric in MEASURES.items()}
+                row |= {"converged": result.converged, "n_iterations": result.n_iterations, "status": "ok"}
                 seconds = result.seconds
             except StudyError as failure:
                 row["status"], seconds = str(failure), float("nan")
             rows.append(row)
             error = row.get("waypoint_error_mm", "failed")
-            print(f"{method.name} {setting:3d} {case.name:9s} {error} {seconds:.1f} s", flush=True)
+            print(f"{method.name} {setting:3d} {pair.source:9s} {error} {seconds:.1f} s", flush=True)
     return pd.DataFrame(rows)
 
 
@@ -145,12 +126,14 @@ def label(method: Method) -> str:
 
 
 def summarise(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean over the cases, best setting first; a setting that failed on a case cannot be the best."""
+    """Mean over the pairs, best setting first; a setting that failed on a case cannot be the best."""
     parameters = list(table.columns[2 : table.columns.get_loc("waypoint_error_mm")])
     summary = (
         table.assign(failed=table["status"] != "ok")
         .groupby("setting", as_index=False)
-        .agg({name: "first" for name in parameters} | dict.fromkeys(MEASURES, "mean") | {"failed": "sum"})
+        .agg(
+            {name: "first" for name in parameters} | dict.fromkeys([*MEASURES, "converged"], "mean") | {"failed": "sum"}
+        )
     )
     return summary.sort_values(["failed", "waypoint_error_mm"], kind="stable")
 
@@ -161,12 +144,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results" / "tuning")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    cases = [development_case(name, seed) for name, seed in PAIRS]
-    for case in cases:
-        start = case.alignment.T_us_ct.apply(case.waypoints)
-        print(f"start {case.name}: waypoints {point_errors_mm(start, case.true_waypoints).mean():.2f} mm", flush=True)
+    pairs = [development_pair(name, seed) for name, seed in PAIRS]
     for name in options.methods:
-        summary = summarise(run_grid(grid(name), cases, whole_too=name == "visible_surface"))
+        summary = summarise(run_grid(grid(name), pairs, whole_too=name == "visible_surface"))
         summary.to_csv(options.out / f"{name}.csv", index=False, lineterminator="\n")
         print(summary.head(8).to_string(index=False))
 

@@ -95,10 +95,10 @@ def three_cases(pair, scanned) -> Budget:
 
 def test_every_case_has_its_rows_in_order(every_case):
     names = [name for name, _ in budget_cases()]
-    assert every_case.sources == names
+    assert every_case.errors == names
     assert every_case.methods == ["coarse"]
     for name in names:
-        mine = every_case.rows[every_case.rows["source"] == name]
+        mine = every_case.rows[every_case.rows["error"] == name]
         metrics = set(mine["metric"])
         assert metrics - {"moved"} == (CLOUD_METRICS | PATH_METRICS) - {"moved"}, name
         assert len(mine) == len(metrics), name
@@ -144,7 +144,7 @@ def test_the_error_of_a_path_is_the_distance_from_where_it_belongs(every_case, p
 
 
 def test_a_refused_sweep_is_listed_and_started_by_hand(three_cases):
-    assert three_cases.refused[["source", "sweep"]].to_numpy().tolist() == [["all", 0]]
+    assert three_cases.refused[["error", "sweep"]].to_numpy().tolist() == [["all", 0]]
     assert three_cases.refused["reason"].iloc[0].startswith("patient: expected")
     assert three_cases.by_hand().to_dict() == {"none": 0, "calibration": 0, "all": 1}
     # By hand is from the place of the sweep without errors: what has not moved on from there costs the same.
@@ -181,9 +181,9 @@ def test_each_repeat_starts_by_hand_from_its_own_sweep(pair, scanned, monkeypatc
 
     monkeypatch.setattr(budgets, "find_chest", find)
     found = run(pair, scanned, repeats=2, methods=("coarse",))
-    assert found.refused[["source", "sweep"]].to_numpy().tolist() == [["calibration", 0], ["calibration", 1]]
+    assert found.refused[["error", "sweep"]].to_numpy().tolist() == [["calibration", 0], ["calibration", 1]]
     values = found.rows[found.rows["metric"] == "waypoint_error_inplane"].pivot(
-        index="repeat", columns="source", values="value"
+        index="repeat", columns="error", values="value"
     )
     assert (values["none"] == values["calibration"]).all()
     assert abs(values["none"][1] - values["none"][0]) > 1

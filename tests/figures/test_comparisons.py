@@ -15,10 +15,10 @@ from study import figures
 
 def budget() -> pd.DataFrame:
     rows = []
-    for k, source in enumerate(("none", "latency", "all")):
-        rows.append({"source": source, "metric": "surface_distance", "method": "", "value": 0.2 + k})
+    for k, error in enumerate(("none", "latency", "all")):
+        rows.append({"error": error, "metric": "surface_distance", "method": "", "value": 0.2 + k})
         rows += [
-            {"source": source, "metric": "waypoint_error", "method": method, "value": 2.0 + k + seed / 10}
+            {"error": error, "metric": "waypoint_error", "method": method, "value": 2.0 + k + seed / 10}
             for method in METHODS
             for seed in range(3)
         ]

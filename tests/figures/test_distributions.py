@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch, Rectangle
 
 from study import figures
+from study.evaluation import in_order
 
 EXAMPLES: dict[str, Callable[[], Figure]] = {
     "waypoint_boxes": lambda: figures.waypoint_boxes(metrics(), paper=PAPER),
@@ -74,7 +75,7 @@ def test_a_source_whose_methods_all_failed_says_so_once() -> None:
 
 def test_the_truth_is_drawn_last_like_a_tuned_method() -> None:
     methods = ("truth", *METHODS)
-    assert figures.in_order(methods)[-1] == "truth"
+    assert in_order(methods)[-1] == "truth"
     style = figures.method_style("truth")
     assert (style.tuned, style.hatch, style.marker) == (True, "", "*")
     for draw in (figures.waypoint_boxes, figures.hd_bars):

@@ -7,6 +7,7 @@ from figure_data import METHODS, metrics, texts
 from matplotlib.colors import to_rgb
 
 from study import figures
+from study.evaluation import in_order
 from study.types import Part
 
 
@@ -47,8 +48,8 @@ def test_new_methods_are_drawn_among_the_others_and_named() -> None:
 
 def test_order_of_methods_does_not_depend_on_their_order_in_the_table() -> None:
     given = ("zeta", "truth", "skeleton_graph", "cpd", "alpha", "icp_tuned", "icp", "cpd")
-    wanted = ["icp", "icp_tuned", "cpd", "skeleton_graph", "alpha", "zeta", "truth"]
-    assert figures.in_order(given) == figures.in_order(given[::-1]) == wanted
+    wanted = ["icp", "cpd", "skeleton_graph", "icp_tuned", "alpha", "zeta", "truth"]
+    assert in_order(given) == in_order(given[::-1]) == wanted
 
 
 def test_levels_share_a_hue_and_the_left_is_lighter() -> None:

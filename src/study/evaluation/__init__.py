@@ -24,7 +24,7 @@ from study.evaluation.distances import (
 )
 from study.evaluation.judgement import Judgement
 from study.evaluation.metrics import METRICS, Metric, Unit, judge
-from study.evaluation.pair import TRUTH, Pair, align_pair, perfect
+from study.evaluation.pair import TRUTH, Pair, align_pair, in_order, perfect
 from study.evaluation.poses import PoseCheck, PoseTrial, check_pose, random_pose, try_poses
 from study.evaluation.statistics import PairedTest, paired_wilcoxon, population_sd
 from study.evaluation.waypoints import intercostal_waypoints
@@ -59,6 +59,7 @@ __all__ = [
     "directed_distances_mm",
     "error_budget",
     "hausdorff_mm",
+    "in_order",
     "intercostal_waypoints",
     "judge",
     "options",

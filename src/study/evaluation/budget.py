@@ -34,10 +34,10 @@ class Budget:
     """The error budget of one patient.
 
     Attributes:
-        rows: ``source`` (of error), ``repeat``, ``metric``, ``method`` ("" for a cloud's own), ``value``; metrics are
+        rows: ``error`` (its name), ``repeat``, ``metric``, ``method`` ("" for a cloud's own), ``value``; metrics are
             ``surface_distance`` (mm), ``covered`` (%), ``moved`` (mm), ``waypoint_error`` and
             ``waypoint_error_inplane`` (mm).
-        refused: ``source``, ``sweep`` and ``reason`` of every sweep that the coarse alignment refused; it was started
+        refused: ``error``, ``sweep`` and ``reason`` of every sweep that the coarse alignment refused; it was started
             by hand.
     """
 
@@ -45,9 +45,9 @@ class Budget:
     refused: pd.DataFrame
 
     @property
-    def sources(self) -> list[str]:
-        """The sources of error, in the order of `budget_cases`."""
-        return list(dict.fromkeys(self.rows["source"]))
+    def errors(self) -> list[str]:
+        """What goes wrong, in the order of `budget_cases`."""
+        return list(dict.fromkeys(self.rows["error"]))
 
     @property
     def methods(self) -> list[str]:
@@ -55,14 +55,14 @@ class Budget:
         return [method for method in dict.fromkeys(self.rows["method"]) if method]
 
     def mean(self, metric: str) -> pd.DataFrame:
-        """Means of one metric over the sweeps: a row a source of error, a column a method ("" for a cloud's own)."""
+        """Means of one metric over the sweeps: a row an error, a column a method ("" for a cloud's own)."""
         chosen = self.rows[self.rows["metric"] == metric]
-        means = chosen.pivot_table(index="source", columns="method", values="value", sort=False)
-        return means.reindex(self.sources)
+        means = chosen.pivot_table(index="error", columns="method", values="value", sort=False)
+        return means.reindex(self.errors)
 
     def by_hand(self) -> pd.Series:
-        """How many sweeps of each source the coarse alignment refused."""
-        return self.refused.groupby("source").size().reindex(self.sources, fill_value=0)
+        """How many sweeps under each error the coarse alignment refused."""
+        return self.refused.groupby("error").size().reindex(self.errors, fill_value=0)
 
 
 @dataclass(frozen=True)
@@ -137,11 +137,11 @@ def error_budget(
             if name == NO_ERRORS:
                 start = chest
             if reason:
-                refused.append({"source": name, "sweep": repeat, "reason": reason})
-            what = {"source": name, "repeat": repeat}
+                refused.append({"error": name, "sweep": repeat, "reason": reason})
+            what = {"error": name, "repeat": repeat}
             rows += [{**what, "metric": metric, "method": "", "value": value} for metric, value in values.items()]
             rows += [{**what, **cost} for cost in _path_costs(pair, chest, scanned, methods, repeat, seed, radius_mm)]
-    return Budget(pd.DataFrame(rows), pd.DataFrame(refused, columns=["source", "sweep", "reason"]))
+    return Budget(pd.DataFrame(rows), pd.DataFrame(refused, columns=["error", "sweep", "reason"]))
 
 
 def _cloud_costs(seen: SweepCloud, scanned: Scanned, spacing_mm: float) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from study.errors import StudyError
 from study.evaluation.distances import CloudDistances, point_errors_mm, waypoint_errors_mm
 from study.evaluation.pair import Pair
 from study.registration import Registration
@@ -49,12 +50,28 @@ class Judgement:
         return waypoint_errors_mm(self.moved, self.pair.waypoints_us, self.normal if in_plane else None)
 
     def true_waypoint_errors_mm(self, *, in_plane: bool = False) -> Floats:
-        """Distance (k,) of the carried waypoints from where they truly belong; only where the truth is known."""
-        assert self.pair.true_waypoints is not None
-        return waypoint_errors_mm(self.moved, self.pair.true_waypoints, self.normal if in_plane else None)
+        """Distance (k,) of the carried waypoints from where they truly belong.
+
+        Raises:
+            StudyError: nothing is known of the pair's truth.
+        """
+        goal = _known(self.pair, self.pair.true_waypoints)
+        return waypoint_errors_mm(self.moved, goal, self.normal if in_plane else None)
 
     @cached_property
     def true_point_errors_mm(self) -> Floats:
-        """Distance (n,) of every warped point from its true place; only where the truth is known."""
-        assert self.pair.true_points is not None
-        return point_errors_mm(self.registration.warped, self.pair.true_points)
+        """Distance (n,) of every warped point from its true place.
+
+        Raises:
+            StudyError: nothing is known of the pair's truth.
+        """
+        return point_errors_mm(self.registration.warped, _known(self.pair, self.pair.true_points))
+
+
+def _known(pair: Pair, places: Floats | None) -> Floats:
+    if places is None:
+        raise StudyError(
+            f"{pair.name}: expected a pair whose deformation is known, got two real people; "
+            "use the measures that need no truth"
+        )
+    return places

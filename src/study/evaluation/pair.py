@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from study.alignment.chest import Alignment, Chest, find_chest
 from study.errors import StudyError
 from study.evaluation.waypoints import intercostal_waypoints
+from study.methods import METHODS
 from study.registration import Registration
 from study.types import Floats, PointCloud
 
 # In place of a method: the known deformation itself, carried and measured as a method's answer is. What it scores is
 # what a perfect registration would, under this protocol.
 TRUTH = "truth"
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Each method once: as ``METHODS`` lists them, then the others by name, `TRUTH` last; so in tables and figures."""
+    known = list(METHODS)
+
+    def place(name: str) -> tuple[bool, int, str]:
+        return name == TRUTH, known.index(name) if name in known else len(known), name
+
+    return sorted(set(methods), key=place)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from study.evaluation.pair import in_order
 from study.evaluation.statistics import population_sd
 from study.figures.canvas import below, new_figure, plain, require, require_columns
 from study.figures.rows import method_row, name_rows, spread, stripe_rows
-from study.figures.style import DARK, GREY, SIMULATED, in_order, method_style
+from study.figures.style import DARK, GREY, SIMULATED, method_style
 from study.types import Floats
 
 __all__ = ["error_budget", "paired_differences", "sensitivity"]
@@ -130,7 +131,7 @@ def error_budget(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     """What each error of the ultrasound does to the cloud and, by method, to the waypoints.
 
     Args:
-        df: long, columns ``source`` (here of the error, in the order to show), ``metric`` (``surface_distance`` of the
+        df: long, columns ``error`` (in the order to show), ``metric`` (``surface_distance`` of the
             cloud or ``waypoint_error``), ``method`` (ignored for the cloud) and ``value`` (mm); several rows of one
             kind (seeds, patients) are dots about their mean.
         note: where the patient is from.
@@ -138,11 +139,11 @@ def error_budget(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     Raises:
         StudyError: no row of either metric.
     """
-    require_columns(df, ("source", "metric", "method", "value"), "rows of study.evaluation.error_budget")
+    require_columns(df, ("error", "metric", "method", "value"), "rows of study.evaluation.error_budget")
     cloud, path = (df[df["metric"] == metric] for metric in ("surface_distance", "waypoint_error"))
     require(cloud, "rows of surface_distance")
     require(path, "rows of waypoint_error")
-    errors, methods = list(dict.fromkeys(df["source"])), in_order(path["method"])
+    errors, methods = list(dict.fromkeys(df["error"])), in_order(path["method"])
     figure = new_figure(1.5 + 0.46 * len(errors), f"What each error of the ultrasound costs ({note})")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=[1, 1.9])
     _strip(left, errors, cloud, 0.0, DARK, "o", DARK)
@@ -168,7 +169,7 @@ def _strip(
 ) -> None:
     """The mean of each error's values as a marker, ``aside`` of its row, their range as a line."""
     for y, error in enumerate(errors):
-        values = rows.loc[rows["source"] == error, "value"].dropna().to_numpy()
+        values = rows.loc[rows["error"] == error, "value"].dropna().to_numpy()
         if len(values) > 1:
             ax.plot([values.min(), values.max()], [y + aside] * 2, color=edge, lw=1, alpha=0.6)
             ax.scatter(values, np.full(len(values), y + aside), s=6, c=edge, lw=0, alpha=0.6)

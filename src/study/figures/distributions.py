@@ -14,10 +14,11 @@ from matplotlib.lines import Line2D
 
 from study.errors import StudyError
 from study.evaluation.metrics import METRICS
+from study.evaluation.pair import in_order
 from study.evaluation.statistics import population_sd
 from study.figures.canvas import method_legend, new_figure, plain, require, require_columns
 from study.figures.rows import method_row, name_rows, spread, stripe_rows
-from study.figures.style import DARK, PAPER, SIMULATED, in_order, method_style
+from study.figures.style import DARK, PAPER, SIMULATED, method_style
 from study.naming import natural_key
 from study.types import Floats
 

@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from study.errors import StudyError
+from study.evaluation.pair import in_order
 from study.figures.canvas import (
     WIDTH_IN,
     View,
@@ -26,7 +27,7 @@ from study.figures.canvas import (
     require,
     thin,
 )
-from study.figures.style import DARK, GREY, PALE, SIMULATED, in_order, lighter, method_style, steps
+from study.figures.style import DARK, GREY, PALE, SIMULATED, lighter, method_style, steps
 from study.geometry.points import nearest
 from study.types import Floats, Ints, RigidTransform, Waypoints, as_points
 

@@ -6,7 +6,7 @@ tuned solid and as shipped lighter and hatched.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from zlib import crc32
 
@@ -17,7 +17,7 @@ from matplotlib.colors import Colormap, to_rgb
 from study.evaluation.pair import TRUTH
 from study.types import CARTILAGES, Floats, Ints, Part
 
-__all__ = ["METHOD_STYLE", "PART_COLOUR", "SIMULATED", "MethodStyle", "in_order", "method_style"]
+__all__ = ["METHOD_STYLE", "PART_COLOUR", "SIMULATED", "MethodStyle", "method_style"]
 
 Colour = tuple[float, float, float]
 
@@ -117,13 +117,3 @@ def method_style(name: str) -> MethodStyle:
     pick = crc32(base.encode())
     colour, marker = _OTHER_COLOURS[pick % 4], _OTHER_MARKERS[pick // 4 % 4]
     return _styles(base, base.replace("_", " "), colour, marker)[name]
-
-
-def in_order(methods: Iterable[str]) -> list[str]:
-    """Each method once: as `METHOD_STYLE` lists them, then the others by name, the truth last."""
-    known = [name for name in METHOD_STYLE if name != TRUTH]
-
-    def place(name: str) -> tuple[bool, int, str]:
-        return name == TRUTH, known.index(name) if name in known else len(known), name
-
-    return sorted(set(methods), key=place)

@@ -3,7 +3,7 @@
 from study.results.compare import Comparison, compare
 from study.results.metrics_csv import CASE, FAILED, read_metrics
 from study.results.run import REFERENCE, Run, against_reference, find_runs, keep_pictures, newest, run_folder
-from study.results.tables import beside_paper, hd_table, in_order, paper_hd_table, paper_waypoints, waypoint_summary
+from study.results.tables import beside_paper, hd_table, paper_hd_table, paper_waypoints, waypoint_summary
 
 __all__ = [
     "CASE",
@@ -16,7 +16,6 @@ __all__ = [
     "compare",
     "find_runs",
     "hd_table",
-    "in_order",
     "keep_pictures",
     "newest",
     "paper_hd_table",

@@ -85,9 +85,13 @@ def _sha256_of_files(root: Path, found: list[Path]) -> str:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Output of git, or None outside a checkout."""
+    """Output of git, or None outside a checkout: another project's repository around the package says nothing."""
+    if not (root / ".git").exists():
+        return None
     try:
-        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True, timeout=30)
+        done = subprocess.run(
+            ["git", *arguments], cwd=root, capture_output=True, encoding="utf-8", check=True, timeout=30
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()

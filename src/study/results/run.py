@@ -16,7 +16,7 @@ import pandas as pd
 
 from study.errors import StudyError
 from study.evaluation.metrics import METRICS
-from study.evaluation.pair import TRUTH
+from study.evaluation.pair import TRUTH, in_order
 from study.files.atomic import json_text, write_bytes, write_json
 from study.files.places import CHECKOUT
 from study.results.compare import Comparison, compare
@@ -30,7 +30,7 @@ from study.results.metrics_csv import (
     write_timings,
 )
 from study.results.provenance import code_sha256, provenance
-from study.results.tables import hd_table, in_order, mean_sd_table, waypoint_summary, write_tables
+from study.results.tables import hd_table, mean_sd_table, waypoint_summary, write_tables
 
 REFERENCE = CHECKOUT / "results" / "reference"
 PAIR = ["source", "target"]

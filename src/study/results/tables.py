@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,10 @@ import pandas as pd
 
 from study.errors import StudyError
 from study.evaluation.metrics import METRICS
-from study.evaluation.pair import TRUTH
+from study.evaluation.pair import TRUTH, in_order
 from study.evaluation.statistics import population_sd
 from study.files.atomic import write_text
 from study.files.places import shipped
-from study.methods import METHODS
 from study.naming import natural_key
 from study.results.metrics_csv import CASE, KEY, NOT_CONVERGED
 
@@ -44,12 +42,6 @@ def write_tables(metrics: pd.DataFrame, out: Path) -> None:
 
 
 PAPER_DATA = "paper (other data)"
-
-
-def in_order(methods: Iterable[str]) -> list[str]:
-    """Each method once, as ``METHODS`` lists them, those it does not know last."""
-    known = list(METHODS)
-    return sorted(dict.fromkeys(methods), key=lambda name: known.index(name) if name in known else len(known))
 
 
 def mean_sd_table(per_pair: pd.DataFrame) -> pd.DataFrame:
