@@ -148,9 +148,14 @@ class World:
 
 Maker = Callable[[World], Case]
 KINDS: dict[str, Maker] = {}
-# A mirror image is a chest; 3-6 are shaped like 2-5; a little rib is a longer cartilage; most of a person half as large
-# again is a person.
-UNDECIDABLE = {"mirrored", "levels 3-6", "with 15 mm of ribs, CT", "with 15 mm of ribs, US"}
+# A mirror image is a chest; 3-6 are shaped like 2-5; a little rib, or 40 % more, is a longer cartilage.
+UNDECIDABLE = {
+    "mirrored",
+    "levels 3-6",
+    "with 15 mm of ribs, CT",
+    "with 15 mm of ribs, US",
+    "another species: limbs 40 % longer",
+}
 CLEAN = set[str]()
 
 

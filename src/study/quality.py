@@ -48,7 +48,7 @@ class Quality:
 QUALITY_LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType(
     {
         "residual_share": (0.15, "of the US points lie over 5 mm from the warped CT cloud: the clouds do not match"),
-        "wrong_part_share": (0.03, "of the warped cartilages lie on another than their own: branches are swapped"),
+        "wrong_part_share": (0.1, "of the warped cartilages lie on another than their own: branches are swapped"),
         "further_motion_mm": (18.0, "mm is how far points moved after the coarse alignment: more than people differ"),
         "stretched_share": (0.4, "of neighbouring points are more than twice or less than half as far apart: torn"),
         "folded_share": (0.3, "of the cloud is folded over as seen from the front"),

@@ -15,6 +15,7 @@ from study.types import Floats
 
 # The limits stand between whole clouds and torn or shifted ones; benchmarks/coarse_margins.py prints by how much.
 MIN_APART_MM = 12.0  # between the roots of neighbours
+MIN_POINTS = 8  # on a branch: fewer tell neither its arch nor its bend
 MIN_LENGTH_MM = 12.0  # beside the sternum
 BESIDE_MM = 20.0  # from the sternum's edge: where neighbours that are two cartilages are apart
 TOUCH_MM = 4.0
@@ -32,6 +33,7 @@ class RootMeasures:
         shortest_mm: reach of the shortest branch from the sternum's edge.
         touch: largest share of a root within ``TOUCH_MM`` of its neighbour.
         fill: density of points between the roots over that on them.
+        fewest: points on the branch that has fewest.
     """
 
     offset_mm: float
@@ -39,6 +41,7 @@ class RootMeasures:
     shortest_mm: float
     touch: float
     fill: float
+    fewest: int
 
 
 def measure_roots(branches: Branches, local: Floats) -> RootMeasures:
@@ -62,6 +65,7 @@ def measure_roots(branches: Branches, local: Floats) -> RootMeasures:
         shortest_mm=float(branch_lengths_mm(branches, local).min()),
         touch=max(max(_share_near(one, other), _share_near(other, one)) for one, other in neighbours),
         fill=float(_count_near(local, between).mean() / max(_count_near(local, seeds).mean(), 1e-9)),
+        fewest=min(int((branches.branch == k).sum()) for k in range(1, 9)),
     )
 
 
@@ -80,6 +84,11 @@ def check_roots(found: RootMeasures, name: str) -> None:
             f"{name}: expected four cartilages a side that leave the sternum in pairs (up to {MAX_OFFSET_MM:g} mm), at "
             f"least {MIN_APART_MM:g} mm apart and {MIN_LENGTH_MM:g} mm long, got {found.offset_mm:.0f}, "
             f"{found.apart_mm:.0f} and {found.shortest_mm:.0f} mm; {CROP}; if it is so cropped, is a branch missing?"
+        )
+    if found.fewest < MIN_POINTS:
+        raise StudyError(
+            f"{name}: expected {MIN_POINTS} points or more on each of eight cartilages, got {found.fewest} on one; "
+            f"{CROP}; if it is so cropped, is a branch missing?"
         )
     if found.touch > MAX_TOUCH:
         raise StudyError(
