@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 import yaml
 
-from study.data.manifest import YAML_LOADER, default_manifest_path, load_manifest
+from study.data.manifest import default_manifest_path, load_manifest
 from study.data.schema import DataFile, LocalSource, Manifest, PypiSource, ZipSource
 from study.errors import StudyError
+from study.files.yaml_text import read_yaml
 
 LEVELS = range(1, 13)
 
@@ -26,7 +27,7 @@ def broken(tmp_path: Path) -> Callable[[Callable[[dict[str, Any]], object]], str
     """The message for the repository's manifest after one change."""
 
     def message(change: Callable[[dict[str, Any]], object]) -> str:
-        raw = copy.deepcopy(yaml.load(default_manifest_path().read_text(encoding="utf-8"), Loader=YAML_LOADER))
+        raw = copy.deepcopy(read_yaml(default_manifest_path())[0])
         change(raw)
         path = tmp_path / "data_manifest.yaml"
         path.write_text(_without_aliases(raw), encoding="utf-8")
@@ -250,7 +251,7 @@ def test_a_missing_or_unreadable_manifest_is_named(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match=r"none\.yaml: expected a readable manifest"):
         load_manifest(tmp_path / "none.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(StudyError, match=r"binary\.yaml: expected a readable manifest"):
+    with pytest.raises(StudyError, match=r"binary\.yaml: expected YAML in UTF-8"):
         load_manifest(tmp_path / "binary.yaml")
 
 

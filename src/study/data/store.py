@@ -19,11 +19,11 @@ import yaml
 from platformdirs import user_cache_path
 from tqdm import tqdm
 
-from study.data.manifest import YAML_LOADER
 from study.data.schema import DataFile, LocalSource, Manifest, PypiSource, ZipSource
 from study.data.web import shown
 from study.errors import StudyError
 from study.files.atomic import digest_of, sha256_of, write_text
+from study.files.yaml_text import located, read_yaml, repeated_keys
 
 LOCK_NAME = "data_lock.yaml"
 YAML_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the lock file is rewritten once per file of a cohort
@@ -206,6 +206,11 @@ def one_at_a_time() -> Iterator[None]:
                 tqdm.write(f"waiting for another fetch into {folder}", file=sys.stderr)
                 fcntl.flock(handle, fcntl.LOCK_EX)
             yield
+    except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+        raise StudyError(
+            f"{folder}: expected a data folder that can be written, got another file or folder in the way at"
+            f" {error.filename}; move that away"
+        ) from error
     except OSError as error:
         raise StudyError(
             f"{folder}: expected a data folder that can be written, got {error}; set STUDY_DATA_DIR to another"
@@ -249,12 +254,15 @@ def _lock() -> dict[str, dict[str, Any]]:
 @lru_cache(maxsize=1)
 def _read_lock(path: Path, _mtime_ns: int, _inode: int) -> dict[str, dict[str, Any]]:
     """The lock file, parsed once per version: it is asked for every file of a cohort."""
+    entries, root = read_yaml(path)
+    if faults := repeated_keys(root):
+        raise located(faults, root, str(path))
+    entries = {} if entries is None else entries
     try:
-        entries = yaml.load(path.read_text(encoding="utf-8"), Loader=YAML_LOADER) or {}
         if all(isinstance(entry["sha256"], str) for entry in entries.values()):
-            return entries
+            return dict(entries)
         raise TypeError("an entry without a sha256")
-    except (yaml.YAMLError, AttributeError, TypeError, KeyError, UnicodeDecodeError) as error:
+    except (AttributeError, TypeError, KeyError) as error:
         raise StudyError(f"{path}: expected file names with their sha256, got {error}; repair or delete it") from error
 
 
