@@ -19,6 +19,7 @@ import yaml
 from platformdirs import user_cache_path
 from tqdm import tqdm
 
+from study.data.archive import check_packed_whole
 from study.data.schema import DataFile, LocalSource, Manifest, PypiSource, ZipSource
 from study.data.web import shown
 from study.errors import StudyError
@@ -79,7 +80,7 @@ def verify(file: DataFile) -> Path:
     if fault is None:
         return path
     if isinstance(file.source, LocalSource) and file.source.member is None:
-        raise StudyError(fault)
+        raise StudyError(f"{fault}; put the right file there or correct the manifest")
     path.unlink()
     raise StudyError(f"{fault}; the bad file was removed, fetch it again")
 
@@ -155,12 +156,14 @@ def missing_local(file: DataFile) -> str:
 
 
 def check_archive(path: Path, n_bytes: int | None, sha256: str | None, md5: str | None) -> None:
-    """An archive is the one the manifest means, as far as that states its size and hashes.
+    """An archive is the one the manifest means, as far as that states its size and hashes; else it is sound.
 
     Raises:
-        StudyError: another size or hash.
+        StudyError: another size or hash, or, where no hash is stated, a checksum of its own that does not match.
     """
     stamp = path.stat()
+    if sha256 is None and md5 is None:
+        _check_packed(path, stamp.st_mtime_ns, stamp.st_size)
     if n_bytes is not None and stamp.st_size != n_bytes:
         raise StudyError(f"{path.name}: expected {n_bytes} bytes, got {stamp.st_size}")
     for algorithm, expected in (("sha256", sha256), ("md5", md5)):
@@ -264,6 +267,12 @@ def _read_lock(path: Path, _mtime_ns: int, _inode: int) -> dict[str, dict[str, A
         raise TypeError("an entry without a sha256")
     except (AttributeError, TypeError, KeyError) as error:
         raise StudyError(f"{path}: expected file names with their sha256, got {error}; repair or delete it") from error
+
+
+@lru_cache(maxsize=64)
+def _check_packed(path: Path, _mtime_ns: int, _n_bytes: int) -> None:
+    """Once per version and process, as `_digest`."""
+    check_packed_whole(path)
 
 
 @lru_cache(maxsize=64)

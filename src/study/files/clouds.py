@@ -24,12 +24,14 @@ def read_ply(path: str | os.PathLike[str]) -> Floats:
     """
     path = Path(path)
     if not path.is_file():
-        raise StudyError(f"expected a PLY file at {path}, got no such file")
+        raise StudyError(f"expected a PLY file at {path}, got no such file; check the path")
     try:
         loaded = trimesh.load(path, file_type="ply", process=False)
     except Exception as error:  # trimesh raises whatever its parser met
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise StudyError(f"{path.name}: expected a PLY file with points, got unreadable bytes: {reason}") from error
+        raise StudyError(
+            f"{path.name}: expected a PLY file with points, got unreadable bytes: {reason}; export it again"
+        ) from error
     return as_points(getattr(loaded, "vertices", np.empty((0, 3))), path.name)
 
 
@@ -43,9 +45,13 @@ def read_waypoints(path: str | os.PathLike[str]) -> Floats:
     try:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
-        raise StudyError(f"expected a CSV file of waypoints at {path}, got: {' '.join(str(error).split())}") from error
+        raise StudyError(
+            f"expected a CSV file of waypoints at {path}, got: {' '.join(str(error).split())}; check the path"
+        ) from error
     if not {"x", "y", "z"} <= set(table.columns):
-        raise StudyError(f"{path.name}: expected columns x, y, z, got {', '.join(map(str, table.columns))}")
+        raise StudyError(
+            f"{path.name}: expected columns x, y, z, got {', '.join(map(str, table.columns))}; rename them"
+        )
     return as_points(table[["x", "y", "z"]].to_numpy(), path.name)
 
 

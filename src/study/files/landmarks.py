@@ -67,8 +67,8 @@ def read_landmarks(path: str | os.PathLike[str]) -> Landmarks:
         got = str(first["input"])[:60]
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         raise StudyError(
-            f"{path.name}: {place}{line_of(root, first['loc'])}: expected another value: {first['msg']}; got {got}{more};"
-            " mend the file"
+            f"{path.name}: {place}{line_of(root, first['loc'])}: expected another value: {first['msg']};"
+            f" got {got}{more}; mend the file"
         ) from error
     return Landmarks(
         file.subject,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import lzma
 import math
 import zlib
 from collections.abc import Iterator
@@ -16,11 +17,16 @@ from numpy.typing import NDArray
 
 from study.errors import StudyError
 
-Encoding = Literal["raw", "gzip", "zlib", "bzip2"]
+Encoding = Literal["raw", "gzip", "zlib", "bzip2", "xz"]
 
 BLOCK_BYTES = 1 << 18  # packed or unpacked: what a processor's cache holds is unpacked twice as fast as megabytes
-BZIP2_BLOCK_BYTES = 1 << 14  # its unpacker's output cannot be bounded as zlib's is
-MAX_RATIO = {"gzip": 1032, "zlib": 1032, "bzip2": 1 << 16}  # no stream unpacks to more: a header that asks is wrong
+UNBOUNDED_BYTES = 1 << 14  # packed, of the formats whose unpacked block is not bounded here
+MAX_RATIO = {
+    "gzip": 1032,
+    "zlib": 1032,
+    "bzip2": 1 << 16,
+    "xz": 1 << 16,
+}  # no stream unpacks to more: a header that asks is wrong
 
 
 @dataclass(frozen=True)
@@ -99,19 +105,15 @@ def unpacked(file: IO[bytes], encoding: Encoding, name: str) -> Iterator[bytes]:
         while block := file.read(BLOCK_BYTES):
             yield block
         return
-    unpacker = _unpacker(encoding)
-    while packed := file.read(BZIP2_BLOCK_BYTES if encoding == "bzip2" else BLOCK_BYTES):
+    unpacker, bounded = _unpacker(encoding), encoding in ("gzip", "zlib")
+    while packed := file.read(BLOCK_BYTES if bounded else UNBOUNDED_BYTES):
         while packed:
             behind = unpacker.eof
             if behind:
                 unpacker = _unpacker(encoding)
             with _damage_told(name, "bytes behind the stream" if behind else "a truncated or damaged file"):
-                if encoding == "bzip2":
-                    block, rest = unpacker.decompress(packed), b""
-                else:
-                    block = unpacker.decompress(packed, BLOCK_BYTES)
-                    rest = unpacker.unconsumed_tail
-            packed = unpacker.unused_data or rest
+                block = unpacker.decompress(packed, BLOCK_BYTES if bounded else -1)
+            packed = unpacker.unused_data or (unpacker.unconsumed_tail if bounded else b"")
             if block:
                 yield block
     if not unpacker.eof:
@@ -122,7 +124,7 @@ def unpacked(file: IO[bytes], encoding: Encoding, name: str) -> Iterator[bytes]:
 def _damage_told(name: str, what: str) -> Iterator[None]:
     try:
         yield
-    except (zlib.error, OSError) as error:  # bz2 raises OSError
+    except (zlib.error, lzma.LZMAError, OSError) as error:  # bz2 raises OSError
         reason = " ".join(str(error).split())
         raise StudyError(
             f"{name}: expected packed data that its checksum confirms, got {what} ({reason}); fetch it again"
@@ -130,6 +132,8 @@ def _damage_told(name: str, what: str) -> Iterator[None]:
 
 
 def _unpacker(encoding: Encoding) -> Any:  # zlib's type has no public name
+    if encoding == "xz":
+        return lzma.LZMADecompressor()
     if encoding == "bzip2":
         return bz2.BZ2Decompressor()
     # zlib compares CRC-32 and length (gzip) or Adler-32 (zlib) by itself when it meets the stream's end.

@@ -139,7 +139,7 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> Path:
     """
     path = Path(path)
     if not path.name.endswith(".nii.gz"):
-        raise StudyError(f"expected a name ending in .nii.gz, got {path.name!r}")
+        raise StudyError(f"expected a name ending in .nii.gz, got {path.name!r}; rename it")
     image = sitk.GetImageFromArray(np.ascontiguousarray(volume.values.T))
     image.SetSpacing(volume.spacing_mm.tolist())
     image.SetOrigin((LPS_TO_RAS @ volume.T_ras_index.translation).tolist())
