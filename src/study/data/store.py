@@ -210,9 +210,11 @@ def one_at_a_time() -> Iterator[None]:
                 fcntl.flock(handle, fcntl.LOCK_EX)
             yield
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+        path = Path(error.filename or folder)
+        way = next((part for part in (path, *path.parents) if part.is_file()), path)
         raise StudyError(
-            f"{folder}: expected a data folder that can be written, got another file or folder in the way at"
-            f" {error.filename}; move that away"
+            f"{folder}: expected a data folder that can be written, got another file or folder in the way at {way};"
+            " move that away"
         ) from error
     except OSError as error:
         raise StudyError(

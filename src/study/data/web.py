@@ -9,13 +9,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NoReturn
+from types import TracebackType
+from typing import NoReturn, Self
 from urllib.parse import urlsplit, urlunsplit
 
 import requests
 from requests.adapters import HTTPAdapter
 from tqdm import tqdm
 from urllib3 import BaseHTTPResponse
+from urllib3.connectionpool import ConnectionPool
 from urllib3.exceptions import HTTPError as TransportError
 from urllib3.util.retry import Retry
 
@@ -36,20 +38,27 @@ class RangesRefused(StudyError):
 class _Patience(Retry):
     """Obeys Retry-After, says so, and gives up at once where it asks for longer than anyone waits unasked."""
 
-    def sleep_for_retry(self, response: BaseHTTPResponse) -> bool:
-        seconds = self.get_retry_after(response)
-        if seconds is None:
-            return False
-        host = urlsplit(response.url or "").hostname or "the server"
-        if seconds > RETRY_AFTER_MAX_S:
+    def increment(
+        self,
+        method: str | None = None,
+        url: str | None = None,
+        response: BaseHTTPResponse | None = None,
+        error: Exception | None = None,
+        _pool: ConnectionPool | None = None,
+        _stacktrace: TracebackType | None = None,
+    ) -> Self:
+        """Count one more try, and look at how long the server asks to wait before it."""
+        seconds = (self.get_retry_after(response) if response is not None else None) or 0.0
+        host = _pool.host if _pool is not None else "the server"
+        if response is not None and seconds > RETRY_AFTER_MAX_S:
             raise StudyError(
                 f"{host}: expected an answer, got HTTP {response.status} and the wish to wait {seconds:.0f} s"
                 " (Retry-After); run the same command again after that, it goes on from there"
             )
+        counted = super().increment(method, url, response, error, _pool, _stacktrace)
         if seconds >= TOLD_WAIT_S:
             tqdm.write(f"{host} asks to wait {seconds:.0f} s (Retry-After)", file=sys.stderr)
-        time.sleep(seconds)
-        return seconds > 0
+        return counted
 
 
 def _refuse_downgrade(response: requests.Response, **_: object) -> None:

@@ -1,4 +1,4 @@
-"""Headers of NIfTI files, versions 1 and 2: whatever they state twice must agree."""
+"""Headers of NIfTI files (version 1, all that ITK reads): whatever they state twice must agree."""
 
 from __future__ import annotations
 
@@ -20,20 +20,14 @@ MILLIMETRES, UNKNOWN_UNIT = 2, 0
 UNITS = {1: "metres", 3: "micrometres"}
 AFFINE_ATOL = 0.5  # of a voxel: near half a turn a quaternion of single precision is off by a tenth of that
 
-Layout = list[tuple[str, str, int]]  # name, format, offset
-LAYOUT_1: Layout = [
+LAYOUT = [
     ("dim", "8i2", 40), ("datatype", "i2", 70), ("bitpix", "i2", 72), ("pixdim", "8f4", 76), ("vox_offset", "f4", 108),
     ("scl_slope", "f4", 112), ("scl_inter", "f4", 116), ("xyzt_units", "u1", 123), ("qform_code", "i2", 252),
     ("sform_code", "i2", 254), ("quatern", "3f4", 256), ("qoffset", "3f4", 268), ("srow", "(3,4)f4", 280),
     ("magic", "S4", 344),
 ]  # fmt: skip
-LAYOUT_2: Layout = [
-    ("dim", "8i8", 16), ("datatype", "i2", 12), ("bitpix", "i2", 14), ("pixdim", "8f8", 104), ("vox_offset", "i8", 168),
-    ("scl_slope", "f8", 176), ("scl_inter", "f8", 184), ("xyzt_units", "i4", 500), ("qform_code", "i4", 344),
-    ("sform_code", "i4", 348), ("quatern", "3f8", 352), ("qoffset", "3f8", 376), ("srow", "(3,4)f8", 400),
-    ("magic", "S8", 4),
-]  # fmt: skip
-VERSIONS = {348: (LAYOUT_1, b"n+1"), 540: (LAYOUT_2, b"n+2\0\r\n\x1a\n")}  # header size: layout, magic
+HEADER_BYTES, HEADER_2_BYTES = 348, 540
+MAGIC = b"n+1"
 
 
 def read_nifti_header(path: Path, name: str) -> Stored:
@@ -49,7 +43,7 @@ def read_nifti_header(path: Path, name: str) -> Stored:
         start = b""
         for block in stream:
             start += block
-            if len(start) >= max(VERSIONS):
+            if len(start) >= HEADER_BYTES:
                 break
         try:
             return _checked(_fields(start, name), path, packed, name)
@@ -61,18 +55,20 @@ def read_nifti_header(path: Path, name: str) -> Stored:
 
 def _fields(start: bytes, name: str) -> dict[str, Any]:
     orders: tuple[Literal["<", ">"], ...] = ("<", ">")
-    for order, (size, (layout, magic)) in itertools.product(orders, VERSIONS.items()):
-        if len(start) >= size and start[:4] == size.to_bytes(4, "little" if order == "<" else "big"):
-            names, formats, offsets = zip(*layout, strict=True)
-            kind = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
+    for order in orders:
+        stated = int.from_bytes(start[:4], "little" if order == "<" else "big")
+        if stated == HEADER_2_BYTES:
+            raise StudyError(f"{name}: expected NIfTI of version 1, got version 2; save it as .nrrd or as version 1")
+        if len(start) >= HEADER_BYTES and stated == HEADER_BYTES:
+            names, formats, offsets = zip(*LAYOUT, strict=True)
+            kind = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": HEADER_BYTES})
             record = np.frombuffer(start, kind.newbyteorder(order), count=1)[0]
-            fields = {key: record[key] for key in names} | {"order": order, "header_bytes": size}
-            if fields["magic"] != magic:
+            if record["magic"] != MAGIC:
                 raise StudyError(
-                    f"{name}: expected the magic {magic!r} of a NIfTI file with its pixels, got {fields['magic']!r};"
+                    f"{name}: expected the magic {MAGIC!r} of a NIfTI file with its pixels, got {record['magic']!r};"
                     " an Analyze file or a header without pixels? save it as .nii.gz"
                 )
-            return fields
+            return {key: record[key] for key in names} | {"order": order}
     raise StudyError(f"{name}: expected a NIfTI header, got a truncated or damaged file; fetch it again")
 
 
@@ -90,7 +86,7 @@ def _checked(header: dict[str, Any], path: Path, packed: bool, name: str) -> Sto
     shape = check_shape([int(n) for n in header["dim"][1 : n_dims + 1]], name)
     _check_geometry(header, shape, name)
     offset = float(header["vox_offset"])
-    if not (offset.is_integer() and header["header_bytes"] + 4 <= offset < 1 << 40):
+    if not (offset.is_integer() and HEADER_BYTES + 4 <= offset < 1 << 40):
         raise StudyError(f"{name}: expected the pixels behind the header, got vox_offset {offset:g}; export it again")
     slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
     if not np.isfinite([slope, intercept]).all():
