@@ -16,6 +16,7 @@ from study.files.yaml_text import read_yaml
 
 LEVELS = range(1, 13)
 RIBFRAC = ("files", "ribfrac421_ct", "source")
+S0011 = ("files", "s0011_ct", "source")
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +190,7 @@ LOCAL = ("files", "ribseg421_ribs", "source")
             "files.lidc_labels.source.member (line N): expected a path beside that of files.lidc_ct, got one in it",
         ),
         (
-            _set("files", "s0011_ct", "source", {"kind": "zip", "url": "https://a/ribfrac-val-images.zip", "member": "a"}),
+            _set(*S0011, {"kind": "zip", "url": "https://a.org/ribfrac-val-images.zip", "member": "a"}),
             "files.s0011_ct.source (line N): expected archive_sha256, because the archive of files.ribfrac421_ct has",
         ),
         (_set(*LOCAL, "sha256", "x" * 64), "files.ribseg421_ribs.source.sha256 (line N): expected 64 hex digits"),

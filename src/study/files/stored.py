@@ -117,7 +117,9 @@ def unpacked(file: IO[bytes], encoding: Encoding, name: str) -> Iterator[bytes]:
             if block:
                 yield block
     if not unpacker.eof:
-        raise StudyError(f"{name}: expected the end of its {encoding} stream, got a truncated file; fetch it again")
+        raise StudyError(
+            f"{name}: expected the end of its {encoding} stream, got a truncated or damaged file; fetch it again"
+        )
 
 
 @contextmanager
@@ -151,5 +153,7 @@ def _rescaled(pixels: NDArray[Any], slope: float, intercept: float) -> NDArray[A
 
 def _mis_sized(name: str, wanted: int, got: int | None, *, whole: bool) -> StudyError:
     found = "more" if got is None else f"{got}"
-    cause = "bytes left over, so its header is wrong or two files are in one" if whole else "a truncated file"
+    cause = (
+        "bytes left over, so its header is wrong or two files are in one" if whole else "a truncated or damaged file"
+    )
     return StudyError(f"{name}: expected {wanted} bytes, got {found}: {cause}; fetch or export it again")

@@ -156,7 +156,7 @@ def read_metaimage_header(path: Path, name: str) -> Stored:
     stated, n_file = fields.get("compresseddatasize", "").split(), data.stat().st_size - offset
     if packed and stated and stated != [str(n_file)]:
         raise StudyError(
-            f"{name}: expected {stated[0]} compressed bytes, got {n_file} in a truncated or mixed-up file; fetch it"
+            f"{name}: expected {stated[0]} compressed bytes, got {n_file} in a truncated or damaged file; fetch it"
             " again"
         )
     return Stored(shape, np.dtype(kind).newbyteorder(">" if big else "<"), data, offset, "zlib" if packed else "raw")
