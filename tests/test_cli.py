@@ -178,6 +178,26 @@ def test_ribseg_without_its_labels_says_what_to_download_and_where_to_put_it(tmp
     assert str(tmp_path / "data" / "ribseg_v2.zip") in told[0]
 
 
+@pytest.mark.parametrize("error", [ZeroDivisionError("by\nnought"), RuntimeError("x"), MemoryError(), RecursionError()])
+def test_anything_unforeseen_is_one_line_with_a_code_of_its_own(
+    error: Exception, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("study.data.manifest.load_manifest", fail)
+    assert main(["datasets"]) == 70
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"study: expected no such error, got {type(error).__name__}")
+    assert err.count("\n") == 1
+    assert main(["--traceback", "datasets"]) == 70
+    assert "Traceback (most recent call last)" in capsys.readouterr().err
+    monkeypatch.setenv("STUDY_TRACEBACK", "1")
+    assert main(["datasets"]) == 70
+    assert "Traceback (most recent call last)" in capsys.readouterr().err
+
+
 # --- register --------------------------------------------------------------------------------------------------------
 
 

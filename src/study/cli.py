@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from traceback import print_exc
 from typing import TYPE_CHECKING
 
 import click
@@ -19,13 +20,18 @@ if TYPE_CHECKING:
     from study.data.schema import Manifest
     from study.results.run import Run
 
+UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: none of 0 (agrees), 1 (differs), 2 (refused)
 DATASETS = "A name in data_manifest.yaml (`study datasets` lists them), or a manifest file of your own."
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="study")
-def cli() -> None:
+@click.option("--traceback", is_flag=True, envvar="STUDY_TRACEBACK", help="Show where an unforeseen error arose.")
+@click.pass_context
+def cli(context: click.Context, traceback: bool) -> None:
     """Thoracic cartilage ultrasound-CT registration with a dense skeleton graph, as a reproducible study."""
+    if isinstance(context.obj, dict):  # `main`, which asks for it after the context has gone
+        context.obj["traceback"] = traceback
 
 
 @cli.group()
@@ -260,10 +266,11 @@ def cloud(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; an expected failure is one line on standard error and exit code 2."""
+    """Run the command line; an expected failure is one line on standard error and exit code 2, any other code 70."""
     chosen = None if arguments is None else list(arguments)
+    options = {"traceback": False}
     try:
-        code = cli.main(args=chosen, prog_name="study", standalone_mode=False)
+        code = cli.main(args=chosen, prog_name="study", standalone_mode=False, obj=options)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return 0
@@ -283,6 +290,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         click.echo("study: stopped", err=True)
         return 130
+    except Exception as error:  # the last line of defence: a bug, or a machine without memory
+        if options["traceback"]:
+            print_exc()
+        reason = " ".join(f"{type(error).__name__} {error}".split())[:500]
+        click.echo(
+            f"study: expected no such error, got {reason}; please report it with what `study --traceback ...` shows",
+            err=True,
+        )
+        return UNFORESEEN
     return code or 0
 
 

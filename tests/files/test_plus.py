@@ -132,6 +132,74 @@ def test_damaged_files_say_what_is_wrong(tmp_path, changes, message):
     assert len(str(caught.value)) < 400
 
 
+TRANSPOSED = "1 0 0 0 0 1 0 0 0 0 1 0 4 5 6 1"
+METRES = "0.0002 0 0 0.004 0 0.0003 0 0.005 0 0 0.0002 0.006 0 0 0 1"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"Seq_Frame0001_ProbeToTrackerTransform": TRANSPOSED}, "frame 1: expected 0 0 0 1 as the last row"),
+        ({"Seq_Frame0000_ImageToProbeTransform": TRANSPOSED}, "0 0 0 1 as the last row of ImageToProbeTransform"),
+        ({"Seq_Frame0000_ImageToProbeTransform": METRES}, "in metres"),
+        ({f"Seq_Frame{i:04d}_ImageStatus": "INVALID" for i in range(2)}, "at least one valid frame, got none of 2"),
+        ({"DimSize": "3 2 2\nDimSize = 2 3 2"}, "one value of DimSize"),
+        ({**ZIPPED, "pixels": zlib.compress(bytes(12))[:-1]}, "truncated|damaged"),
+        ({**ZIPPED, "pixels": zlib.compress(bytes(12)) + b"x"}, "bytes behind it"),
+        ({**ZIPPED, "pixels": zlib.compress(bytes(12))[:-1] + b"x"}, "damaged"),
+    ],
+)
+def test_faults_that_read_well_are_refused(tmp_path, changes, message):
+    with pytest.raises(StudyError, match=message):
+        read_plus(foreign(tmp_path / "bad.igs.mha", **changes))
+
+
+def test_transposed_poses_of_our_own_files_are_refused(tmp_path):
+    write_plus(tmp_path / "a.igs.mha", make_sweep())
+    whole = (tmp_path / "a.igs.mha").read_bytes()
+    for key, told in (
+        (b"Study_Pose000003", "every Study_Pose"),
+        (b"Study_ProbeImageTransform", "last row of Study_Probe"),
+    ):
+        line = next(line for line in whole.split(b"\n") if line.startswith(key))
+        (tmp_path / "b.igs.mha").write_bytes(whole.replace(line, line[: line.rindex(b" ")] + b" 2.0"))
+        with pytest.raises(StudyError, match=told):
+            read_plus(tmp_path / "b.igs.mha")
+
+
+MASK = bytes([0, 0, 255, 0, 0, 0, 255, 0, 0, 0, 0, 0])  # asymmetric: the last column, then the first
+STAMPS = [f"Seq_Frame{i:04d}_Timestamp" for i in range(2)]
+
+
+@pytest.mark.parametrize("orientation", ["MF", "UF", "MN", "UN"])
+def test_masks_without_an_orientation_lie_as_the_images_do(tmp_path, orientation):
+    images = foreign(tmp_path / "a.igs.mha", pixels=MASK, UltrasoundImageOrientation=orientation)
+    # As a program that knows nothing of ultrasound writes it.
+    stack = np.frombuffer(MASK, np.uint8).reshape(2, 2, 3)
+    sitk.WriteImage(sitk.GetImageFromArray(stack), str(tmp_path / "m.mha"), useCompression=True)
+    sweep = read_plus(images, masks=tmp_path / "m.mha")
+    np.testing.assert_array_equal(sweep.masks, sweep.images > 0)
+    stated = foreign(tmp_path / "s.mha", pixels=MASK, UltrasoundImageOrientation="MF")
+    np.testing.assert_array_equal(read_plus(images, masks=stated).masks, stack > 0)
+
+
+def test_masks_must_be_masks_of_the_same_recording(tmp_path):
+    images = foreign(tmp_path / "a.igs.mha")
+    with pytest.raises(StudyError, match="got 12 grey levels; is this the B-mode"):
+        read_plus(images, masks=images)
+    late = {stamp: f"{10.05 + i}" for i, stamp in enumerate(STAMPS)}
+    with pytest.raises(StudyError, match=r"m\.mha: frame 0: expected the time stamp of a\.igs.*another recording"):
+        read_plus(images, masks=foreign(tmp_path / "m.mha", pixels=MASK, **late))
+    with pytest.raises(StudyError, match="size of the images"):
+        read_plus(images, masks=foreign(tmp_path / "m.mha", pixels=MASK, DimSize="2 3 2"))
+    with pytest.raises(StudyError, match="says it holds images"):
+        read_plus(images, masks=foreign(tmp_path / "m.mha", pixels=MASK, Study_Content="images"))
+    with pytest.raises(StudyError, match="grey levels"):
+        read_plus(foreign(tmp_path / "own.igs.mha", Study_Content="masks"))
+    for kept in (foreign(tmp_path / "m.mha", pixels=MASK), foreign(tmp_path / "n.mha", pixels=MASK, drop=STAMPS)):
+        assert read_plus(images, masks=kept).masks.sum() == 2
+
+
 def test_a_bomb_is_not_inflated(tmp_path):
     path = foreign(tmp_path / "bomb.igs.mha", **ZIPPED, pixels=zlib.compress(bytes(100_000_000), 9))
     tracemalloc.start()

@@ -50,7 +50,17 @@ def write_png(path, array, vector=False):
         (lambda f: (f / "masks" / "000003.png").write_bytes(b"no image"), "damaged"),
         (lambda f: write_png(f / "masks" / "000003.png", np.zeros((5, 5), np.uint8)), "13 x 11 pixels"),
         (lambda f: write_png(f / "masks" / "000003.png", np.zeros((11, 13, 3), np.uint8), True), "3 channels"),
+        (
+            lambda f: write_png(f / "masks" / "000003.png", np.arange(143, dtype=np.uint8).reshape(11, 13)),
+            "000003.png: expected masks of 0 and one other value, got 143 grey levels",
+        ),
         (lambda f: (f / "sweep.json").write_text("{"), "expected JSON"),
+        (lambda f: (f / "sweep.json").write_text('{"pixel_spacing_mm": [0.0002, 0.0003]}'), "in metres"),
+        (lambda f: (f / "sweep.json").write_text('{"pixel_spacing_mm": ["a", "b"]}'), "expected numbers"),
+        (
+            lambda f: (f / "sweep.json").write_text('{"T_probe_image": [[1,0,0,0], [0,1,0,0], [0,0,1,0], [4,5,6,1]]}'),
+            "0 0 0 1 as T_probe_image's last row",
+        ),
         (lambda f: (f / "sweep.json").write_text('{"latency_ms": 268}'), "check the names"),
         (lambda f: (f / "sweep.json").write_text('{"pixel_spacing_mm": 0.2}'), "expected numbers"),
         (

@@ -87,6 +87,13 @@ def test_labels_must_be_whole_and_on_the_grid(tmp_path: Path) -> None:
     assert (read.values == 1).all()
     with pytest.raises(StudyError, match="fractions"):
         read_labels(write_volume(ct.with_values(np.full(ct.shape, 0.5, np.float32)), tmp_path / "f.nii.gz"))
+    for wrong in (40_000.0, -40_000.0, np.inf):
+        values = np.where(np.arange(5) == 2, wrong, 1.0) * np.ones(ct.shape)
+        with pytest.raises(StudyError, match="label ids of -32768 to 32767"):  # 40,000 would become -25,536
+            read_labels(write_volume(ct.with_values(values.astype(np.float32)), tmp_path / "w.nii.gz"))
+    values = np.where(np.arange(5) == 2, np.nan, 1.0) * np.ones(ct.shape)
+    with pytest.raises(StudyError, match="fractions or NaN"):
+        read_labels(write_volume(ct.with_values(values.astype(np.float32)), tmp_path / "n.nii.gz"))
     with pytest.raises(StudyError, match="expected the grid of ct"):
         read_labels(labels, like=ct.crop([0, 0, 0], [6, 7, 4]))
     moved = Volume(ct.values, ct.spacing_mm, RigidTransform(translation=np.array([0.0, 0.5, 0.0])), "moved")

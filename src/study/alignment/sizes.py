@@ -43,10 +43,12 @@ class Limit:
 
     def told(self, who: str, value: float) -> str:
         """Expected, got, what to do."""
-        unit = f" {self.unit}" if self.unit else ""
-        return (
-            f"{who}: expected {self.title} of {self.low:g} to {self.high:g}{unit}, got {value:.3g}{unit}; {self.hint}"
-        )
+        return f"{who}: expected {self.title} of {self.range}, got {value:.3g}; {self.hint}"
+
+    @property
+    def range(self) -> str:
+        """``"38 to 116 mm"``."""
+        return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
 
 _SCALE = f"{CROP}; check that the units are mm"
@@ -133,7 +135,9 @@ def _signs(who: str, sizes: Mapping[str, float]) -> list[str]:
     excess = {name: limit.excess(sizes[name]) for name, limit in LIMITS.items()}
     told = [LIMITS[name].told(who, sizes[name]) for name in excess if excess[name] > 0]
     if len(told) >= TOO_MANY or any(excess[name] > REFUSE and LIMITS[name].unit == "mm" for name in excess):
-        raise StudyError(told[0])
+        first = next(name for name in excess if excess[name] > 0)
+        limit = LIMITS[first]
+        raise StudyError(f"{who}: expected {limit.title} of {limit.range}, got {sizes[first]:.3g}; {limit.hint}")
     return told
 
 

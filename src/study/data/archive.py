@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import lzma
 import stat
 import tarfile
 import zipfile
@@ -14,8 +15,10 @@ from typing import IO
 
 from study.errors import StudyError
 from study.files.atomic import replacing
+from study.files.stored import Encoding, unpacked
 
 BLOCK_BYTES = 1 << 20
+TAR_PACKERS: dict[bytes, Encoding] = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\0": "xz"}
 
 
 def is_safe_member(name: str) -> bool:
@@ -53,7 +56,26 @@ def check_regular(info: zipfile.ZipInfo, where: str) -> None:
     """Refuse a zip member that is a folder, a link or encrypted."""
     mode = info.external_attr >> 16
     if info.is_dir() or (stat.S_IFMT(mode) and not stat.S_ISREG(mode)) or info.flag_bits & 0x1:
-        raise StudyError(f"{where}: expected a plain file, got a folder, link or encrypted member {info.filename!r}")
+        raise StudyError(
+            f"{where}: expected a plain file, got a folder, link or encrypted member {info.filename!r}; name another"
+        )
+
+
+def check_packed_whole(archive: Path) -> None:
+    """Read a packed tar archive to its end, where its checksum is; a zip has one for each member.
+
+    Whoever reads a member stops before that end, so a flipped bit would go unseen.
+
+    Raises:
+        StudyError: a checksum that does not match, a stream that ends early, or bytes behind it.
+    """
+    with archive.open("rb") as file:
+        magic = file.read(6)
+        encoding = next((encoding for start, encoding in TAR_PACKERS.items() if magic.startswith(start)), None)
+        if encoding is not None:
+            file.seek(0)
+            for _ in unpacked(file, encoding, archive.name):
+                pass
 
 
 @contextmanager
@@ -76,10 +98,12 @@ def open_member(archive: Path, wanted: str) -> Iterator[IO[bytes]]:
             member = tar.getmember(find_member(tar.getnames(), wanted, where))
             packed = tar.extractfile(member) if member.isreg() else None
             if packed is None:
-                raise StudyError(f"{where}: expected a plain file, got a folder, link or device {wanted!r}")
+                raise StudyError(
+                    f"{where}: expected a plain file, got a folder, link or device {wanted!r}; name another"
+                )
             with packed:
                 yield packed
-    except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError) as error:
+    except (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError) as error:
         raise StudyError(
             f"{where}: expected a sound zip or tar archive, got {error}; delete it and fetch again"
         ) from error

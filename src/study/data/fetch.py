@@ -50,7 +50,7 @@ def fetch(file: DataFile, *, progress: bool = False, web: Web | None = None) -> 
     if fault is None:
         return path
     if isinstance(file.source, LocalSource) and (file.source.member is None or not local_path(file).exists()):
-        raise StudyError(fault)
+        raise StudyError(f"{fault}; put the right file there or correct the manifest" if path.exists() else fault)
     return _fetch_absent([file], progress, web)[0]
 
 
@@ -75,7 +75,7 @@ def fetch_all(
     wanted = [file for file in files.values() if not is_good(file)]
     for file in wanted:
         if isinstance(file.source, LocalSource) and file.source.member is None:
-            raise StudyError(fault_of(file, path_of(file)))
+            raise StudyError(f"{fault_of(file, path_of(file))}; put the right file there or correct the manifest")
     if wanted:
         _fetch_absent(wanted, progress, web)
     return {key: path_of(file) for key, file in files.items()}

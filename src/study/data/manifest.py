@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import urlsplit
 
 import yaml
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from study.data.schema import MANIFEST_NAME, Cohort, LocalSource, Manifest, PypiSource, SubjectEntry
+from study.data.schema import (
+    MANIFEST_NAME,
+    Cohort,
+    DataFile,
+    LocalSource,
+    Manifest,
+    PypiSource,
+    SubjectEntry,
+    ZipSource,
+)
 from study.errors import StudyError
 from study.files.places import shipped
-
-YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same YAML, read ten times faster where libyaml is
-
-Fault = tuple[tuple[Any, ...], str]
+from study.files.yaml_text import Fault, located, read_yaml, repeated_keys
 
 
 def default_manifest_path() -> Path:
@@ -33,35 +40,31 @@ def load_manifest(path: Path | str | None = None) -> Manifest:
         StudyError: no such file, not YAML, or what it says breaks the schema; every fault is named by its key.
     """
     own = default_manifest_path() if path is None else Path(path).expanduser().resolve()
-    text = _read(own)
-    try:
-        root = yaml.compose(text, Loader=YAML_LOADER)
-        raw = yaml.load(text, Loader=YAML_LOADER)
-    except yaml.YAMLError as error:
-        raise StudyError(f"{own.name}: expected YAML, got {' '.join(str(error).split())}") from error
-    faults = _repeated_keys(root)
+    raw, root = _read(own)
+    faults = repeated_keys(root)
     if not isinstance(raw, dict):
-        raise StudyError(f"{own.name}: expected the keys files, cohorts and label_maps, got {type(raw).__name__}")
+        raise StudyError(
+            f"{own.name}: expected the keys files, cohorts and label_maps, got {type(raw).__name__}; write them as"
+            f" {MANIFEST_NAME} does"
+        )
     if path is not None and isinstance(maps := raw.setdefault("label_maps", {}), dict):
-        raw["label_maps"] = yaml.load(_read(default_manifest_path()), Loader=YAML_LOADER)["label_maps"] | maps
+        raw["label_maps"] = _read(default_manifest_path())[0]["label_maps"] | maps
     try:
         manifest = Manifest.model_validate(raw)
     except ValidationError as error:
         faults += [_fault(detail) for detail in error.errors(include_url=False)]
     else:
         manifest = manifest.read_from(own)
-        faults += list(_loose_ends(manifest))
+        faults += [*_loose_ends(manifest), *_collisions(manifest)]
     if faults:
-        count = f"{len(faults)} faults: " if len(faults) > 1 else ""
-        told = "; ".join(f"{'.'.join(map(str, at)) or 'top level'}{_line(root, at)}: {what}" for at, what in faults)
-        raise StudyError(f"{own.name}: {count}{told}")
+        raise located(faults, root, own.name)
     return manifest
 
 
-def _read(path: Path) -> str:
+def _read(path: Path) -> tuple[Any, yaml.Node | None]:
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return read_yaml(path)
+    except OSError as error:
         raise StudyError(f"{path}: expected a readable manifest, got {error}; check the path") from error
 
 
@@ -79,6 +82,36 @@ def _loose_ends(manifest: Manifest) -> Iterable[Fault]:
         for key, subject in cohort.subjects.items():
             at = ("cohorts", name, "subjects", key)
             yield from ((at + where, what) for where, what in _subject_faults(manifest, cohort, subject))
+
+
+def _collisions(manifest: Manifest) -> Iterable[Fault]:
+    """Files that would take each other's place in the data folder."""
+    members = {_place(file): key for key, file in manifest.files.items()}
+    zips: dict[str, tuple[str, str]] = {}  # file name of an archive: its address, and the first key
+    for key, file in manifest.files.items():
+        archive, member = _place(file)
+        for parent in member.parents:
+            if (archive, parent) in members:
+                other = members[archive, parent]
+                yield ("files", key, "source", "member"), f"expected a path beside that of files.{other}, got one in it"
+        if isinstance(file.source, ZipSource):
+            url, other = zips.setdefault(PurePosixPath(urlsplit(archive).path).name, (archive, key))
+            if url != archive and not (file.source.archive_sha256 or file.source.archive_md5):
+                what = f"expected archive_sha256, because the archive of files.{other} has the same name, got none"
+                yield ("files", key, "source"), what
+
+
+def _place(file: DataFile) -> tuple[str, PurePosixPath]:
+    """The archive of a file and the path in it."""
+    source = file.source
+    match source:
+        case PypiSource():
+            archive = f"{source.archive} {source.sha256}"
+        case ZipSource():
+            archive = source.url
+        case LocalSource():
+            archive = source.path
+    return archive, PurePosixPath(source.member or "")
 
 
 def _subject_faults(manifest: Manifest, cohort: Cohort, subject: SubjectEntry) -> Iterable[Fault]:
@@ -133,35 +166,3 @@ def _fault(detail: ErrorDetails) -> Fault:
     words = words if words.startswith("expected") else f"expected {words[:1].lower()}{words[1:]}"
     shown = repr(got) if not isinstance(got, dict | list) else f"a {type(got).__name__} of {len(got)}"
     return tuple(at), f"{words}, got {shown}"
-
-
-def _repeated_keys(node: yaml.Node | None, at: tuple[Any, ...] = ()) -> list[Fault]:
-    """Keys that stand twice in one mapping, of which YAML would silently keep the last."""
-    faults: list[Fault] = []
-    if isinstance(node, yaml.MappingNode):
-        seen: set[str] = set()
-        for key, value in node.value:
-            if key.value in seen:
-                faults.append(((*at, key.value), "expected the key once, got it twice"))
-            seen.add(key.value)
-            faults += _repeated_keys(value, (*at, key.value))
-    elif isinstance(node, yaml.SequenceNode):
-        for index, value in enumerate(node.value):
-            faults += _repeated_keys(value, (*at, index))
-    return faults
-
-
-def _line(node: yaml.Node | None, at: tuple[Any, ...]) -> str:
-    """``" (line 41)"`` of the deepest key on the way to ``at`` that stands in the file."""
-    line = 0
-    for step in at:
-        pairs: list[tuple[Any, yaml.Node, yaml.Node]] = []
-        if isinstance(node, yaml.MappingNode):
-            pairs = [(key.value, key, value) for key, value in node.value]
-        elif isinstance(node, yaml.SequenceNode):
-            pairs = [(str(index), value, value) for index, value in enumerate(node.value)]
-        match = next(((mark, value) for name, mark, value in pairs if name == str(step)), None)
-        if match is None:
-            break
-        line, node = match[0].start_mark.line + 1, match[1]
-    return f" (line {line})" if line else ""

@@ -50,7 +50,14 @@ Key = Annotated[str, _expect(r"[A-Za-z0-9][A-Za-z0-9._-]*", "a name of letters, 
 Sha256 = Annotated[str, _expect(r"[0-9a-f]{64}", "64 hex digits")]
 Md5 = Annotated[str, _expect(r"[0-9a-f]{32}", "32 hex digits")]
 Crc32 = Annotated[str, _expect(r"[0-9a-f]{8}", "8 hex digits")]
-Url = Annotated[str, _expect(r"https?://[^\s/]+/\S*[^\s/]", "an http(s) address of a file")]
+LOOPBACK = r"(?:localhost|127(?:\.\d{1,3}){3}|\[::1\])(?::\d+)?"
+Url = Annotated[
+    str,
+    _expect(
+        rf"(?:https://[^\s/]+|http://{LOOPBACK})/\S*[^\s/]",
+        "an https address of a file (http can be changed on its way; it is allowed on this machine only)",
+    ),
+]
 FileName = Annotated[str, _expect(r"[^/\\\s][^/\\]*", "a file name without a folder")]
 Member = Annotated[str, AfterValidator(_member)]
 Orientation = Annotated[str, AfterValidator(_orientation)]

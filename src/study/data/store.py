@@ -19,11 +19,12 @@ import yaml
 from platformdirs import user_cache_path
 from tqdm import tqdm
 
-from study.data.manifest import YAML_LOADER
+from study.data.archive import check_packed_whole
 from study.data.schema import DataFile, LocalSource, Manifest, PypiSource, ZipSource
 from study.data.web import shown
 from study.errors import StudyError
 from study.files.atomic import digest_of, sha256_of, write_text
+from study.files.yaml_text import located, read_yaml, repeated_keys
 
 LOCK_NAME = "data_lock.yaml"
 YAML_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the lock file is rewritten once per file of a cohort
@@ -79,7 +80,7 @@ def verify(file: DataFile) -> Path:
     if fault is None:
         return path
     if isinstance(file.source, LocalSource) and file.source.member is None:
-        raise StudyError(fault)
+        raise StudyError(f"{fault}; put the right file there or correct the manifest")
     path.unlink()
     raise StudyError(f"{fault}; the bad file was removed, fetch it again")
 
@@ -155,12 +156,14 @@ def missing_local(file: DataFile) -> str:
 
 
 def check_archive(path: Path, n_bytes: int | None, sha256: str | None, md5: str | None) -> None:
-    """An archive is the one the manifest means, as far as that states its size and hashes.
+    """An archive is the one the manifest means, as far as that states its size and hashes; else it is sound.
 
     Raises:
-        StudyError: another size or hash.
+        StudyError: another size or hash, or, where no hash is stated, a checksum of its own that does not match.
     """
     stamp = path.stat()
+    if sha256 is None and md5 is None:
+        _check_packed(path, stamp.st_mtime_ns, stamp.st_size)
     if n_bytes is not None and stamp.st_size != n_bytes:
         raise StudyError(f"{path.name}: expected {n_bytes} bytes, got {stamp.st_size}")
     for algorithm, expected in (("sha256", sha256), ("md5", md5)):
@@ -206,6 +209,13 @@ def one_at_a_time() -> Iterator[None]:
                 tqdm.write(f"waiting for another fetch into {folder}", file=sys.stderr)
                 fcntl.flock(handle, fcntl.LOCK_EX)
             yield
+    except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+        path = Path(error.filename or folder)
+        way = next((part for part in (path, *path.parents) if part.is_file()), path)
+        raise StudyError(
+            f"{folder}: expected a data folder that can be written, got another file or folder in the way at {way};"
+            " move that away"
+        ) from error
     except OSError as error:
         raise StudyError(
             f"{folder}: expected a data folder that can be written, got {error}; set STUDY_DATA_DIR to another"
@@ -249,13 +259,22 @@ def _lock() -> dict[str, dict[str, Any]]:
 @lru_cache(maxsize=1)
 def _read_lock(path: Path, _mtime_ns: int, _inode: int) -> dict[str, dict[str, Any]]:
     """The lock file, parsed once per version: it is asked for every file of a cohort."""
+    entries, root = read_yaml(path)
+    if faults := repeated_keys(root):
+        raise located(faults, root, str(path))
+    entries = {} if entries is None else entries
     try:
-        entries = yaml.load(path.read_text(encoding="utf-8"), Loader=YAML_LOADER) or {}
         if all(isinstance(entry["sha256"], str) for entry in entries.values()):
-            return entries
+            return dict(entries)
         raise TypeError("an entry without a sha256")
-    except (yaml.YAMLError, AttributeError, TypeError, KeyError, UnicodeDecodeError) as error:
+    except (AttributeError, TypeError, KeyError) as error:
         raise StudyError(f"{path}: expected file names with their sha256, got {error}; repair or delete it") from error
+
+
+@lru_cache(maxsize=64)
+def _check_packed(path: Path, _mtime_ns: int, _n_bytes: int) -> None:
+    """Once per version and process, as `_digest`."""
+    check_packed_whole(path)
 
 
 @lru_cache(maxsize=64)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NoReturn
+from types import TracebackType
+from typing import NoReturn, Self
 from urllib.parse import urlsplit, urlunsplit
 
 import requests
 from requests.adapters import HTTPAdapter
 from tqdm import tqdm
+from urllib3 import BaseHTTPResponse
+from urllib3.connectionpool import ConnectionPool
 from urllib3.exceptions import HTTPError as TransportError
 from urllib3.util.retry import Retry
 
@@ -24,10 +28,47 @@ USER_AGENT = f"study/{__version__} (chest CT registration study; fetches single 
 RETRIED_STATUSES = (429, 500, 502, 503, 504)
 BLOCK_BYTES = 1 << 16
 RETRY_AFTER_MAX_S = 120
+TOLD_WAIT_S = 5  # a wait that is shorter looks like work
 
 
 class RangesRefused(StudyError):
     """The server answers a range request with the whole file."""
+
+
+class _Patience(Retry):
+    """Obeys Retry-After, says so, and gives up at once where it asks for longer than anyone waits unasked."""
+
+    def increment(
+        self,
+        method: str | None = None,
+        url: str | None = None,
+        response: BaseHTTPResponse | None = None,
+        error: Exception | None = None,
+        _pool: ConnectionPool | None = None,
+        _stacktrace: TracebackType | None = None,
+    ) -> Self:
+        """Count one more try, and look at how long the server asks to wait before it."""
+        seconds = (self.get_retry_after(response) if response is not None else None) or 0.0
+        host = _pool.host if _pool is not None else "the server"
+        if response is not None and seconds > RETRY_AFTER_MAX_S:
+            raise StudyError(
+                f"{host}: expected an answer, got HTTP {response.status} and the wish to wait {seconds:.0f} s"
+                " (Retry-After); run the same command again after that, it goes on from there"
+            )
+        counted = super().increment(method, url, response, error, _pool, _stacktrace)
+        if seconds >= TOLD_WAIT_S:
+            tqdm.write(f"{host} asks to wait {seconds:.0f} s (Retry-After)", file=sys.stderr)
+        return counted
+
+
+def _refuse_downgrade(response: requests.Response, **_: object) -> None:
+    """Stop at a redirect from https to http, before it is followed."""
+    target = urlsplit(response.headers.get("Location", "")) if response.is_redirect else None
+    if target is not None and target.scheme == "http" and urlsplit(response.url).scheme == "https":
+        raise StudyError(
+            f"{shown(response.url)}: expected to stay on https, got a redirect to http on {target.hostname}, where the"
+            " file can be changed on its way; correct the address"
+        )
 
 
 def shown(url: str) -> str:
@@ -56,15 +97,16 @@ class Web:
     def session(self) -> requests.Session:
         """A session that retries refused and dropped connections, 429 and 5xx before it answers."""
         session = requests.Session()
-        retry = Retry(
+        retry = _Patience(
             total=self.attempts - 1,
             other=0,  # a certificate that is wrong stays wrong
             status_forcelist=RETRIED_STATUSES,
             backoff_factor=self.backoff_s,
-            retry_after_max=RETRY_AFTER_MAX_S,
+            retry_after_max=7 * 24 * 3600,  # not cut to what is waited: `_Patience` must see what is asked for
         )
         for scheme in ("https://", "http://"):
             session.mount(scheme, HTTPAdapter(max_retries=retry))
+        session.hooks["response"].append(_refuse_downgrade)
         session.headers["User-Agent"] = USER_AGENT
         session.headers["Accept-Encoding"] = "identity"  # the bytes that were hashed, not a recoding of them
         return session

@@ -25,12 +25,14 @@ def read_ply(path: str | os.PathLike[str]) -> Floats:
     """
     path = Path(path)
     if not path.is_file():
-        raise StudyError(f"expected a PLY file at {path}, got no such file")
+        raise StudyError(f"expected a PLY file at {path}, got no such file; check the path")
     try:
         loaded = trimesh.load(path, file_type="ply", process=False)
     except Exception as error:  # trimesh raises whatever its parser met
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise StudyError(f"{path.name}: expected a PLY file with points, got unreadable bytes: {reason}") from error
+        raise StudyError(
+            f"{path.name}: expected a PLY file with points, got unreadable bytes: {reason}; export it again"
+        ) from error
     return as_points(getattr(loaded, "vertices", np.empty((0, 3))), path.name)
 
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import SimpleITK as sitk
 
 from study.errors import StudyError
-from study.files.headers import ORTHOGONAL_ATOL, explain
+from study.files.headers import ORTHOGONAL_ATOL, check_spacing, explain
 from study.types import Floats
 
 TILT_MM = 0.1  # per slice: DICOM positions are rounded to 0.001 mm, a tilt of 1 degree shifts 1 mm slices by 0.02 mm
+PREAMBLE_BYTES, MAGIC = 128, b"DICM"
+NOT_SLICES = ("dicomdir", "lockfile", "version")  # what writers of media put beside the slices
 STEP_RTOL = 0.05  # slice positions of a real series vary by rounding; a missing slice doubles one
 
 
@@ -25,14 +28,22 @@ def read_dicom(folder: Path, name: str) -> sitk.Image:
         name: for messages.
 
     Raises:
-        StudyError: no series, several, a single slice, unknown geometry, missing slices, or gantry tilt.
+        StudyError: no series, several, a single slice, unknown geometry, missing or damaged slices, or gantry tilt.
     """
     files = _one_series(folder, name)
     headers = [_dicom_header(file, name) for file in files]
-    positions = np.array([position for position, _ in headers])
-    orientations = np.array([orientation for _, orientation in headers])
+    positions = np.array([header.position for header in headers])
+    orientations = np.array([header.orientation for header in headers])
+    for file, header in zip(files, headers, strict=True):
+        if header.layout != headers[0].layout:
+            raise StudyError(
+                f"{name}: expected slices of one size and PixelSpacing, got {header.layout} in {Path(file).name} and"
+                f" {headers[0].layout} in {Path(files[0]).name}; fetch the series again"
+            )
     if np.abs(orientations - orientations[0]).max() > ORTHOGONAL_ATOL:
-        raise StudyError(f"{name}: expected one ImageOrientationPatient, got several; is this a localiser?")
+        raise StudyError(
+            f"{name}: expected one ImageOrientationPatient, got several in one series; take the localiser out"
+        )
     normal = np.cross(orientations[0, :3], orientations[0, 3:])
     order = np.argsort(positions @ normal)
     height_mm = _slice_height_mm(positions[order], normal, name)
@@ -60,7 +71,28 @@ def _one_series(folder: Path, name: str) -> tuple[str, ...]:
     files: tuple[str, ...] = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0])
     if len(files) < 2:
         raise StudyError(f"{name}: expected a 3-D series, got {len(files)} DICOM slice; give the whole series")
+    _check_others(folder, files, name)
     return files
+
+
+def _check_others(folder: Path, files: tuple[str, ...], name: str) -> None:
+    """No other file of the folder looks like a slice: GDCM drops one that it cannot read without a word.
+
+    In the middle of a series that leaves a gap; at its end the image would only be shorter.
+    """
+    taken = {Path(file).name for file in files}
+    suffixes = {Path(file).suffix.lower() for file in files}
+    for path in sorted(folder.iterdir()):
+        if path.name in taken or path.name.startswith(".") or path.stem.lower() in NOT_SLICES or not path.is_file():
+            continue
+        with path.open("rb") as file:
+            file.seek(PREAMBLE_BYTES)
+            dicom = file.read(len(MAGIC)) == MAGIC
+        if dicom or path.suffix.lower() in suffixes:
+            raise StudyError(
+                f"{name}: expected every slice to be readable, got a damaged slice {path.name}, or a file that is none;"
+                " fetch it again, or take it out of the folder if it does not belong to the series"
+            )
 
 
 def _slice_height_mm(positions: Floats, normal: Floats, name: str) -> float:
@@ -84,28 +116,43 @@ def _slice_height_mm(positions: Floats, normal: Floats, name: str) -> float:
     return float(heights.mean())
 
 
-def _dicom_header(file: str, name: str) -> tuple[list[float], list[float]]:
-    """A slice's ImagePositionPatient (3) and ImageOrientationPatient (6); its PixelSpacing must be there."""
+class _Slice(NamedTuple):
+    position: list[float]  # (3,) LPS+ mm
+    orientation: list[float]  # (6,)
+    layout: str  # size and spacing
+
+
+def _dicom_header(file: str, name: str) -> _Slice:
+    """A slice's ImagePositionPatient, ImageOrientationPatient, size and PixelSpacing, which must all be there."""
     reader = sitk.ImageFileReader()
     reader.SetFileName(file)
     try:
         reader.ReadImageInformation()
     except RuntimeError as error:
         raise explain(error, name) from error
-    found = []
-    for tag, what, count in (("0020|0032", "ImagePositionPatient", 3), ("0020|0037", "ImageOrientationPatient", 6)):
-        text = reader.GetMetaData(tag) if reader.HasMetaDataKey(tag) else ""
+
+    def values(what: str, count: int, *tags: str) -> list[float]:
+        text = next((reader.GetMetaData(tag) for tag in tags if reader.HasMetaDataKey(tag)), "")
         try:
-            numbers = [float(part) for part in text.split("\\")]
+            found = [float(part) for part in text.split("\\")]
         except ValueError:
-            numbers = []
-        if len(numbers) != count:
+            found = []
+        if len(found) != count or not np.isfinite(found).all():
             raise StudyError(
-                f"{name}: expected {what} in every slice, got {text!r} in {Path(file).name}; unknown orientation"
+                f"{name}: expected {count} finite numbers as {what} in every slice, got {text!r} in"
+                f" {Path(file).name}; export the series again"
             )
-        found.append(numbers)
-    if not (reader.HasMetaDataKey("0028|0030") or reader.HasMetaDataKey("0018|1164")):
+        return found
+
+    position = values("ImagePositionPatient, the origin,", 3, "0020|0032")
+    orientation = values("ImageOrientationPatient", 6, "0020|0037")
+    spacing = values("PixelSpacing", 2, "0028|0030", "0018|1164")
+    check_spacing(np.array(spacing), name, f"in {Path(file).name} PixelSpacing")
+    axes = np.array(orientation).reshape(2, 3)
+    if not np.allclose(axes @ axes.T, np.eye(2), atol=ORTHOGONAL_ATOL):
         raise StudyError(
-            f"{name}: expected PixelSpacing in every slice, got none in {Path(file).name}; missing spacing"
+            f"{name}: expected an ImageOrientationPatient of two unit vectors at right angles, got {orientation} in"
+            f" {Path(file).name}; export the series again"
         )
-    return found[0], found[1]
+    size = reader.GetSize()
+    return _Slice(position, orientation, f"{size[0]} x {size[1]} pixels of {spacing[0]:g} x {spacing[1]:g} mm")

@@ -1,52 +1,24 @@
-"""Headers of images, checked before the pixels are read: what SimpleITK would fill in silently is refused.
+"""What all headers of images must say, whatever their format; what SimpleITK would fill in silently is refused.
 
-SimpleITK does not say that a header left the geometry out: it fills in 1 mm and an identity direction, and zeros for
-voxels that are missing. A registration in millimetres cannot be built on that.
+SimpleITK does not say that a header left the geometry out: it fills in 1 mm, an identity direction and an origin of
+zero. A registration in millimetres cannot be built on that.
 """
 
 from __future__ import annotations
 
-import gzip
 import math
-import os
 import re
-import struct
-import zlib
 from pathlib import Path
-from typing import IO
 
+import numpy as np
 import SimpleITK as sitk
 
 from study.errors import StudyError
+from study.types import Floats
 
-NIFTI1_BYTES = 348  # header size, and its first field
 ORTHOGONAL_ATOL = 1e-3  # direction cosines are stored with 4-6 digits
-
-
-def check_header(path: Path, name: str) -> None:
-    """A NIfTI, NRRD or MetaImage file states its spacing and orientation, holds all its bytes, and is 3-D and grey.
-
-    Args:
-        path: the file.
-        name: for messages.
-
-    Raises:
-        StudyError: it does not; the message says what is missing.
-    """
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    suffix = path.name.lower()
-    if suffix.endswith((".nrrd", ".nhdr")):
-        _check_nrrd(path, name)
-    elif suffix.endswith((".mha", ".mhd")):
-        _check_metaimage(path, name)
-    else:
-        _check_nifti(path, name)
-    try:
-        reader.ReadImageInformation()
-    except RuntimeError as error:
-        raise explain(error, name) from error
-    _check_size(reader, path, name)
+MAX_LINE = 1 << 16
+MAX_LINES = 10_000
 
 
 def explain(error: Exception, name: str) -> StudyError:
@@ -62,92 +34,114 @@ def explain(error: Exception, name: str) -> StudyError:
     return StudyError(f"{name}: expected a readable image, got a truncated or damaged file; fetch it again ({reason})")
 
 
-def _check_nrrd(path: Path, name: str) -> None:
-    fields = _text_header(path, end="")
-    if not ({"space directions", "spacings"} & fields.keys()):
-        raise StudyError(f"{name}: expected 'space directions' in the NRRD header, got no spacing; export it again")
-    if "space directions" not in fields or "space" not in fields:
-        raise StudyError(
-            f"{name}: expected 'space' and 'space directions' in the NRRD header, got an unknown orientation; "
-            "export it again as left-posterior-superior or right-anterior-superior"
-        )
+def read_text_header(path: Path, name: str, end: str) -> tuple[dict[str, str], int]:
+    """Lower-case keys of an NRRD (``key: value``) or MetaImage (``Key = value``) header, and where it ends.
 
+    Args:
+        path: the file.
+        name: for messages.
+        end: key of the last line; "" where an empty line, or the file's end, ends it.
 
-def _check_metaimage(path: Path, name: str) -> None:
-    fields = _text_header(path, end="elementdatafile")
-    if not ({"elementspacing", "elementsize"} & fields.keys()):
-        raise StudyError(f"{name}: expected ElementSpacing in the MetaImage header, got none; export it again")
-    if not ({"transformmatrix", "rotation", "orientation"} & fields.keys()):
-        raise StudyError(f"{name}: expected TransformMatrix in the MetaImage header, got an unknown orientation")
-
-
-def _check_nifti(path: Path, name: str) -> None:
-    """ITK replaces a zero spacing by 1 mm and missing voxels by zeros, without a word."""
-    unpack = gzip.open if path.name.lower().endswith(".gz") else open
-    with unpack(path, "rb") as stream:
-        try:
-            header = stream.read(NIFTI1_BYTES)
-        except (OSError, EOFError) as error:
-            raise explain(error, name) from error
-        order = "<" if header[:4] == NIFTI1_BYTES.to_bytes(4, "little") else ">"
-        if len(header) < NIFTI1_BYTES or struct.unpack_from(f"{order}i", header)[0] != NIFTI1_BYTES:
-            if header[:4] in ((540).to_bytes(4, "little"), (540).to_bytes(4, "big")):
-                return  # NIfTI-2, with another layout
-            raise StudyError(f"{name}: expected a NIfTI header, got a truncated or damaged file; fetch it again")
-        dims = struct.unpack_from(f"{order}8h", header, 40)
-        bits = struct.unpack_from(f"{order}h", header, 72)[0]
-        pixdim = struct.unpack_from(f"{order}8f", header, 76)
-        first = int(struct.unpack_from(f"{order}f", header, 108)[0])
-        codes = struct.unpack_from(f"{order}2h", header, 252)
-        if codes == (0, 0):
-            raise StudyError(
-                f"{name}: expected a qform or sform in the NIfTI header, got an unknown orientation "
-                "(both codes are 0); export it again with its affine"
-            )
-        if min(abs(step) for step in pixdim[1:4]) < 1e-6:
-            raise StudyError(f"{name}: expected a positive voxel spacing, got pixdim {pixdim[1:4]}; repair the header")
-        expected = first + math.prod(max(n, 1) for n in dims[1 : dims[0] + 1]) * bits // 8
-        if _stream_bytes(path, stream, expected) < expected:
-            raise StudyError(f"{name}: expected {expected} bytes, got a truncated or damaged file; fetch it again")
-
-
-def _stream_bytes(path: Path, stream: IO[bytes] | gzip.GzipFile, expected: int) -> int:
-    """Length of an open file's content; a gzip file states it in its last 4 bytes, else it is unpacked to count."""
-    if not path.name.lower().endswith(".gz"):
-        return path.stat().st_size
-    with path.open("rb") as packed:
-        packed.seek(-4, os.SEEK_END)
-        if int.from_bytes(packed.read(4), "little") == expected % 2**32:
-            return expected
-    try:
-        while stream.read(1 << 24):
-            pass
-        return stream.tell()
-    except (OSError, EOFError, zlib.error):
-        return 0
-
-
-def _text_header(path: Path, end: str) -> dict[str, str]:
-    """Lower-case keys of an NRRD (``key: value``) or MetaImage (``Key = value``) header, up to line ``end``."""
+    Raises:
+        StudyError: no end, or a key that stands twice with different values.
+    """
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
-        for raw in stream:
+        for _ in range(MAX_LINES):
+            raw = stream.readline(MAX_LINE)
             line = raw.decode("latin-1").strip()
             if end == "" and line == "":
-                break
+                return fields, stream.tell()
             key, _, value = (part.strip() for part in re.sub("[:=]+", "\0", line, count=1).partition("\0"))
-            if not line.startswith("#"):
-                fields[key.lower()] = value
-            if key.lower() == end and end:
+            key = key.lower()
+            if not line.startswith("#") and fields.setdefault(key, value) != value:
+                raise StudyError(
+                    f"{name}: expected {key!r} once in the header, got {fields[key]!r} and {value!r}; delete one"
+                )
+            if key == end:
+                return fields, stream.tell()
+            if not raw.endswith(b"\n"):
                 break
-    return fields
+    raise StudyError(f"{name}: expected a header that ends, got none or a truncated file; fetch it again")
 
 
-def _check_size(reader: sitk.ImageFileReader, path: Path, name: str) -> None:
-    if reader.GetDimension() != 3 or min(reader.GetSize()) < 2:
-        size = " x ".join(str(n) for n in reader.GetSize())
+def numbers(text: str, count: int, name: str, what: str) -> Floats:
+    """``count`` finite numbers out of a header's field; ``what`` says which.
+
+    Raises:
+        StudyError: another count, no numbers, NaN or infinity.
+    """
+    try:
+        found = np.array([float(part) for part in text.replace(",", " ").split()])
+    except ValueError:
+        found = np.empty(0)
+    if len(found) != count or not np.isfinite(found).all():
+        raise StudyError(f"{name}: expected {count} finite numbers as {what}, got {text[:80]!r}; export it again")
+    return found
+
+
+def check_spacing(spacing: Floats, name: str, what: str) -> None:
+    """Every step between voxels (3) mm is a positive number.
+
+    Raises:
+        StudyError: zero, negative, NaN or infinite.
+    """
+    if not (np.isfinite(spacing).all() and (spacing > 1e-6).all()):
+        raise StudyError(f"{name}: expected a positive voxel spacing, got {what} {spacing.tolist()}; repair the header")
+
+
+def check_origin(origin: Floats, name: str, what: str) -> None:
+    """The first voxel's place (3) mm is finite.
+
+    Raises:
+        StudyError: NaN or infinity.
+    """
+    if not np.isfinite(origin).all():
+        raise StudyError(f"{name}: expected a finite origin, got {what} {origin.tolist()}; repair the header")
+
+
+def check_shape(sizes: list[int], name: str) -> tuple[int, int, int]:
+    """Sizes of a volume, further axes of one element dropped.
+
+    Raises:
+        StudyError: not 3-D.
+    """
+    shape = list(sizes)
+    while len(shape) > 3 and shape[-1] == 1:
+        shape.pop()
+    if len(shape) != 3 or min(shape) < 2:
+        size = " x ".join(str(n) for n in sizes)
         raise StudyError(f"{name}: expected a 3-D image, got {size}; give the whole series, one time point")
-    if reader.GetNumberOfComponents() != 1:
+    return shape[0], shape[1], shape[2]
+
+
+def beside(path: Path, data_file: str, name: str) -> Path:
+    """The one file of pixels that a header names, relative to the header's folder.
+
+    Raises:
+        StudyError: a list or a pattern of files, or none there.
+    """
+    data = path.parent / data_file
+    if data_file.startswith("LIST") or "%" in data_file or not data.is_file():
         raise StudyError(
-            f"{name}: expected one value a voxel, got {reader.GetNumberOfComponents()}; colour or vector image?"
+            f"{name}: expected one file of pixels beside the header, got {data_file!r}; save header and pixels as one"
         )
+    return data
+
+
+def itk_geometry(path: Path, shape: tuple[int, int, int], name: str) -> tuple[Floats, Floats, Floats]:
+    """Spacing (3) mm, axes (3, 3) and origin (3) mm in LPS+ as ITK reads them, whose size must be ``shape``.
+
+    Raises:
+        StudyError: ITK cannot read the header, or reads another size out of it.
+    """
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(path))
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError as error:
+        raise explain(error, name) from error
+    if tuple(reader.GetSize())[:3] != shape or math.prod(reader.GetSize()[3:]) != 1:
+        raise StudyError(f"{name}: expected {shape} voxels, got {reader.GetSize()} from ITK; export it again")
+    axes = np.array(reader.GetDirection()).reshape(reader.GetDimension(), -1)[:3, :3]
+    return np.array(reader.GetSpacing()[:3]), axes, np.array(reader.GetOrigin()[:3])

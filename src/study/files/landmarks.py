@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from study.ct.landmarks import Landmarks
 from study.errors import StudyError
+from study.files.yaml_text import line_of, located, read_yaml, repeated_keys
 from study.types import CARTILAGES, Floats, Part
 
 Point = Annotated[list[Annotated[float, Field(ge=-3000.0, le=3000.0)]], Field(min_length=3, max_length=3)]  # RAS+ mm
@@ -47,18 +47,18 @@ def read_landmarks(path: str | os.PathLike[str]) -> Landmarks:
     """Read ``annotations/<subject>.yaml``.
 
     Raises:
-        StudyError: no file, not YAML, a key that is missing, unknown or of the wrong kind (the message has its
-            place), or points that are no RAS+ chest.
+        StudyError: no file, not YAML, a key that is missing, unknown, repeated or of the wrong kind (the message has
+            its place), or points that are no RAS+ chest.
     """
     path = Path(path)
     try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        raw, root = read_yaml(path)
     except FileNotFoundError as error:
         raise StudyError(
             f"expected a landmark file at {path}, got nothing there; make one as the README shows"
         ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path.name}: expected YAML, got {' '.join(str(error).split())}; mend the file") from error
+    if faults := repeated_keys(root):
+        raise located(faults, root, path.name)
     try:
         file = _File.model_validate(raw)
     except ValidationError as error:
@@ -66,7 +66,10 @@ def read_landmarks(path: str | os.PathLike[str]) -> Landmarks:
         place = ".".join(str(step) for step in first["loc"]) or "the file"
         got = str(first["input"])[:60]
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        raise StudyError(f"{path.name}: {place}: expected another value: {first['msg']}; got {got}{more}") from error
+        raise StudyError(
+            f"{path.name}: {place}{line_of(root, first['loc'])}: expected another value: {first['msg']};"
+            f" got {got}{more}; mend the file"
+        ) from error
     return Landmarks(
         file.subject,
         _by_part(file.junctions),

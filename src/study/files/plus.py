@@ -19,6 +19,10 @@ MAX_LINE = 1 << 16
 MAX_DEFLATE_RATIO = 1032  # zlib cannot do better: a header that asks for more is wrong
 ELEMENT_TYPES = {"MET_UCHAR": "u1", "MET_CHAR": "i1", "MET_USHORT": "u2", "MET_SHORT": "i2", "MET_FLOAT": "f4"}
 
+ORIENTATION = "UltrasoundImageOrientation"
+SAME_TIME_S = 1e-3  # stamps are rounded to a millisecond or less; frames lie 10 ms and more apart
+METRES_BELOW_MM = 0.005  # no probe for a chest has pixels so small
+
 Header = dict[str, str]
 
 
@@ -40,7 +44,8 @@ def read_plus(
 
     Args:
         path: the file.
-        masks: a second metafile of the same frames that holds their masks.
+        masks: a second metafile of the same frames that holds their masks. It is taken to lie as the images do where
+            it states no orientation, as files of programs that know nothing of ultrasound.
         probe: the probe's frame in the names of the file's transforms.
         base: the base frame in them; ``<probe>To<base>Transform`` is used, or both over ``Tracker``.
         pixel_spacing_mm: (sx, sy) mm, instead of the file's.
@@ -48,7 +53,8 @@ def read_plus(
         latency_s: instead of the file's; files of other programs have none, which is 0.
 
     Raises:
-        StudyError: not a metafile, truncated or mis-sized data, no time stamps, no poses, or values out of range.
+        StudyError: not a metafile, truncated, damaged or mis-sized data, no time stamps, no poses or valid frames,
+            values out of range, or masks that are B-mode or of another recording.
 
     Examples:
         >>> import tempfile
@@ -63,7 +69,8 @@ def read_plus(
         (2, (2, 3, 4), 'recorded')
     """
     path = Path(path)
-    header, pixels = _read_metafile(path)
+    header, stack = _read_metafile(path)
+    pixels = _turn(path, stack, header.get(ORIENTATION, "MF"))
     frames = _frame_fields(path, header, len(pixels))
     times = np.array([_numbers(path, fields, "Timestamp", 1, f"frame {i}: ")[0] for i, fields in enumerate(frames)])
     poses, valid, pose_times = _own_poses(path, header) or (*_frame_poses(path, frames, probe, base), times)
@@ -74,13 +81,15 @@ def read_plus(
     shown = np.array([fields.get("ImageStatus", "OK") == "OK" for fields in frames])
     annotated = header.get("Study_Content") == "masks"
     bones = pixels if annotated else None
+    if not shown.any():
+        raise StudyError(
+            f"{path.name}: expected at least one valid frame, got none of {len(shown)} (ImageStatus); record with the"
+            " image on"
+        )
+    if bones is not None:
+        check_masks(bones, path.name)
     if masks is not None:
-        bones = _read_metafile(Path(masks))[1]
-        if bones.shape != pixels.shape:
-            raise StudyError(
-                f"{Path(masks).name}: expected masks of the size of the images {pixels.shape}, got {bones.shape};"
-                " export all frames alike"
-            )
+        bones = _read_masks(Path(masks), path, header.get(ORIENTATION, "MF"), pixels.shape, times)
     return TrackedSweep(
         frame_times_s=times[shown],
         poses=poses,
@@ -95,8 +104,47 @@ def read_plus(
     )
 
 
+def check_masks(stack: NDArray[Any], name: str) -> None:
+    """Pixels are 0 or one other value, as masks are and B-mode is not.
+
+    Raises:
+        StudyError: several values.
+    """
+    top = stack.max()
+    if not ((stack == 0) | (stack == top)).all():
+        raise StudyError(
+            f"{name}: expected masks of 0 and one other value, got {len(np.unique(stack))} grey levels; is this the"
+            " B-mode? export the annotation alone"
+        )
+
+
+def _read_masks(path: Path, images: Path, orientation: str, shape: tuple[int, ...], times: Floats) -> NDArray[Any]:
+    """The masks (f, h, w) of the frames of ``images``, in the orientation MF."""
+    header, stack = _read_metafile(path)
+    bones = _turn(path, stack, header.get(ORIENTATION, orientation))
+    if header.get("Study_Content", "masks") != "masks":
+        raise StudyError(
+            f"{path.name}: expected masks, got a file that says it holds {header['Study_Content']}; give the annotation"
+        )
+    if bones.shape != shape:
+        raise StudyError(
+            f"{path.name}: expected masks of the size of the images {shape}, got {bones.shape}; export all frames alike"
+        )
+    check_masks(bones, path.name)
+    for i, fields in enumerate(_frame_fields(path, header, len(bones))):
+        if "Timestamp" not in fields:  # other programs keep none: then only the size can tell
+            continue
+        time = float(_numbers(path, fields, "Timestamp", 1, f"frame {i}: ")[0])
+        if not abs(time - times[i]) < SAME_TIME_S:
+            raise StudyError(
+                f"{path.name}: frame {i}: expected the time stamp of {images.name}, {times[i]:.6f} s, got {time:.6f} s;"
+                " these are masks of another recording"
+            )
+    return bones
+
+
 def _read_metafile(path: Path) -> tuple[Header, NDArray[Any]]:
-    """Header and pixels (f, h, w) in the orientation MF."""
+    """Header and pixels (f, h, w) as they are stored."""
     if not path.is_file():
         raise StudyError(f"{path.name}: expected a metafile, got nothing at {path}; check the path")
     header: Header = {}
@@ -110,7 +158,11 @@ def _read_metafile(path: Path) -> tuple[Header, NDArray[Any]]:
                 raise StudyError(
                     f"{path.name}: expected {what}, got {found}; the file is truncated or not a PLUS sequence metafile"
                 )
-            header[key.strip()] = value.strip()
+            if header.setdefault(key.strip(), value.strip()) != value.strip():
+                raise StudyError(
+                    f"{path.name}: expected one value of {key.strip()}, got {header[key.strip()][:40]!r} and"
+                    f" {value.strip()[:40]!r}; delete the wrong one"
+                )
         data = file.read()
     if header["ElementDataFile"] != "LOCAL":
         raise StudyError(
@@ -138,7 +190,7 @@ def _read_metafile(path: Path) -> tuple[Header, NDArray[Any]]:
             " truncated or its DimSize wrong"
         )
     stack = np.frombuffer(data, dtype=dtype).reshape(f, h, w).astype(dtype.newbyteorder("="), copy=False)
-    return header, _turn(path, stack, header.get("UltrasoundImageOrientation", "MF")[:2].upper())
+    return header, stack
 
 
 def _inflate(path: Path, header: Header, data: bytes, n_bytes: int) -> bytes:
@@ -163,11 +215,17 @@ def _inflate(path: Path, header: Header, data: bytes, n_bytes: int) -> bytes:
         ) from error
     if surplus:
         raise StudyError(f"{path.name}: expected {n_bytes} bytes by DimSize, got more; DimSize is wrong")
+    if not stream.eof or stream.unused_data:  # the checksum stands at the stream's very end
+        raise StudyError(
+            f"{path.name}: expected pixels that end with their checksum, got a truncated stream or bytes behind it;"
+            " copy the file again"
+        )
     return pixels
 
 
 def _turn(path: Path, stack: NDArray[Any], orientation: str) -> NDArray[Any]:
     """From a PLUS orientation (first letter: the column axis; second: the row axis) to MF."""
+    orientation = orientation[:2].upper()
     if len(orientation) == 2 and orientation[0] in "FN" and orientation[1] in "MU":
         stack, orientation = stack.transpose(0, 2, 1), orientation[::-1]
     if len(orientation) != 2 or orientation[0] not in "MU" or orientation[1] not in "FN":
@@ -175,6 +233,17 @@ def _turn(path: Path, stack: NDArray[Any], orientation: str) -> NDArray[Any]:
             f"{path.name}: expected UltrasoundImageOrientation like MF or UN, got {orientation!r}; correct it"
         )
     return stack[:, :: -1 if orientation[1] == "N" else 1, :: -1 if orientation[0] == "U" else 1]
+
+
+def _matrix(path: Path, fields: Header, key: str, where: str = "") -> Floats:
+    """A (4, 4) matrix, whose last row is 0 0 0 1."""
+    matrix = _numbers(path, fields, key, 16, where).reshape(4, 4)
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        raise StudyError(
+            f"{path.name}: {where}expected 0 0 0 1 as the last row of {key}, as proper rotations with a translation"
+            f" have, got {matrix[3].tolist()}; a transposed matrix? write it row by row"
+        )
+    return matrix
 
 
 def _numbers(path: Path, fields: Header, key: str, n: int, where: str = "") -> Floats:
@@ -219,7 +288,12 @@ def _own_poses(path: Path, header: Header) -> tuple[Floats, Bools, Floats] | Non
         raise StudyError(
             f"{path.name}: expected Study_Pose lines of time, status and 16 numbers; they are damaged"
         ) from None
-    return table[:, 1:].reshape(-1, 4, 4), valid, table[:, 0]
+    poses = table[:, 1:].reshape(-1, 4, 4)
+    if not np.allclose(poses[valid, 3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        raise StudyError(
+            f"{path.name}: expected 0 0 0 1 as the last row of every Study_Pose, got others; write it again"
+        )
+    return poses, valid, table[:, 0]
 
 
 def _frame_poses(path: Path, frames: list[Header], probe: str, base: str) -> tuple[Floats, Bools]:
@@ -245,7 +319,7 @@ def _transforms(path: Path, frames: list[Header], key: str) -> tuple[Floats, Boo
     poses, valid = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), dtype=bool)
     for i, fields in enumerate(frames):
         if key in fields and fields.get(f"{key}Status", "OK") == "OK":
-            poses[i], valid[i] = _numbers(path, fields, key, 16, f"frame {i}: ").reshape(4, 4), True
+            poses[i], valid[i] = _matrix(path, fields, key, f"frame {i}: "), True
     if not valid.any():
         raise StudyError(
             f"{path.name}: expected valid poses {key}, got none in {len(frames)} frames; was the probe in view?"
@@ -263,13 +337,12 @@ def _calibration(
             sx, sy = _numbers(path, header, "Study_PixelSpacingMm", 2)
             spacing = (float(sx), float(sy))
         if "Study_ProbeImageTransform" in header:
-            matrix = _numbers(path, header, "Study_ProbeImageTransform", 16).reshape(4, 4)
-            transform = RigidTransform.from_matrix(matrix)
+            transform = RigidTransform.from_matrix(_matrix(path, header, "Study_ProbeImageTransform"))
         return spacing, transform
     key = f"ImageTo{probe}Transform"
     for fields in frames:
         if key in fields and fields.get(f"{key}Status", "OK") == "OK":
-            matrix = _numbers(path, fields, key, 16).reshape(4, 4)
+            matrix = _matrix(path, fields, key)
             break
     else:
         return None, None
@@ -277,5 +350,10 @@ def _calibration(
     sx, sy = float(np.linalg.norm(x)), float(np.linalg.norm(y))
     if not (sx > 0 and sy > 0 and abs(x @ y) < 1e-2 * sx * sy):
         raise StudyError(f"{path.name}: expected {key} with square axes, got a sheared or empty one; calibrate again")
+    if max(sx, sy) < METRES_BELOW_MM:
+        raise StudyError(
+            f"{path.name}: expected {key} from pixels to mm, got pixels of {sx:g} x {sy:g} mm; in metres? multiply its"
+            " first three rows by 1000"
+        )
     rotation, _ = Rotation.align_vectors([x / sx, y / sy], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     return (sx, sy), RigidTransform(rotation.as_matrix(), matrix[:3, 3])

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from study.errors import StudyError
 from study.files.atomic import replacing, write_text
+from study.files.plus import METRES_BELOW_MM, check_masks
 from study.types import Bools, RigidTransform
 from study.ultrasound.tracked import TrackedSweep
 
@@ -29,7 +30,8 @@ def read_folder(folder: str | os.PathLike[str]) -> TrackedSweep:
     4 rows of 4, ``latency_s``; each may be left out).
 
     Raises:
-        StudyError: a missing file or column, an image of another size or with colour, or values out of range.
+        StudyError: a missing file or column, an image of another size, with colour or of more grey levels than a mask's
+            two, or values out of range.
     """
     folder = Path(folder)
     frames = _read_table(folder / "frames.csv", ["file", "time_s"])
@@ -50,6 +52,10 @@ def read_folder(folder: str | os.PathLike[str]) -> TrackedSweep:
     settings = _read_settings(folder / "sweep.json")
     spacing, matrix = settings.get("pixel_spacing_mm"), settings.get("T_probe_image")
     try:
+        if spacing is not None and max(float(spacing[0]), float(spacing[1])) < METRES_BELOW_MM:
+            raise StudyError(f"sweep.json: expected pixel_spacing_mm, got {spacing}; in metres? multiply by 1000")
+        if matrix is not None and not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+            raise StudyError(f"sweep.json: expected 0 0 0 1 as T_probe_image's last row, got {matrix[3]}; transposed?")
         return TrackedSweep(
             frame_times_s=frames["time_s"].to_numpy(dtype=np.float64),
             poses=poses,
@@ -61,7 +67,9 @@ def read_folder(folder: str | os.PathLike[str]) -> TrackedSweep:
             latency_s=float(settings.get("latency_s", 0.0)),
             name=str(settings.get("name", folder.name)),
         )
-    except (TypeError, IndexError) as error:
+    except StudyError:
+        raise
+    except (TypeError, IndexError, ValueError) as error:
         raise StudyError(f"sweep.json: expected numbers, got something else ({error}); see read_folder") from error
 
 
@@ -104,7 +112,7 @@ def _read_table(path: Path, columns: list[str]) -> pd.DataFrame:
     try:
         table = pd.read_csv(path)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path.name}: expected a CSV table, got something else ({error})") from error
+        raise StudyError(f"{path.name}: expected a CSV table, got something else ({error}); save it again") from error
     missing = [column for column in columns if column not in table]
     if missing or table.empty:
         raise StudyError(
@@ -123,7 +131,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise StudyError(f"{path.name}: expected JSON, got something else ({error})") from error
+        raise StudyError(f"{path.name}: expected JSON, got something else ({error}); mend it") from error
     known = {"name", "latency_s", "pixel_spacing_mm", "T_probe_image"}
     if not isinstance(settings, dict) or not set(settings) <= known:
         raise StudyError(
@@ -154,10 +162,12 @@ def _read_masks(folder: Path, names: list[str]) -> Bools:
                     f"{name}: expected {masks.shape[2]} x {masks.shape[1]} pixels as in the first mask, got"
                     f" {size[0]} x {size[1]}; export all frames alike"
                 )
-            masks[i] = sitk.GetArrayFromImage(reader.Execute()) > 0
+            pixels = sitk.GetArrayFromImage(reader.Execute())
+            check_masks(pixels, name)
+            masks[i] = pixels > 0
         except RuntimeError as error:
             raise StudyError(
-                f"{name}: expected a readable image, got a damaged one ({type(error).__name__})"
+                f"{name}: expected a readable image, got a damaged one ({type(error).__name__}); export it again"
             ) from error
     assert masks is not None  # the table has rows
     return masks

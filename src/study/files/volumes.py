@@ -1,6 +1,7 @@
 """Images of one frame (RAS+ mm) and one axis order (R, A, S): reading and writing, no guessed geometry.
 
-SimpleITK reads NIfTI, NRRD, MHA and DICOM series, all into LPS+ mm; here they are turned at the edge.
+SimpleITK reads the geometry of NIfTI, NRRD, MHA and DICOM series, all into LPS+ mm; here they are turned at the edge.
+Pixels are unpacked here, because ITK stops before the checksum of a compressed stream and so never compares it.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import SimpleITK as sitk
@@ -17,11 +19,22 @@ from scipy.optimize import linear_sum_assignment
 from study.errors import StudyError
 from study.files.atomic import replacing
 from study.files.dicom import read_dicom
-from study.files.headers import ORTHOGONAL_ATOL, check_header, explain
+from study.files.headers import ORTHOGONAL_ATOL, itk_geometry
+from study.files.nifti import read_nifti_header
+from study.files.stored import read_pixels
+from study.files.text_images import read_metaimage_header, read_nrrd_header
 from study.types import Floats, RigidTransform, Volume
 
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0])
-SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+HEADERS = {
+    ".nii": read_nifti_header,
+    ".nii.gz": read_nifti_header,
+    ".nrrd": read_nrrd_header,
+    ".nhdr": read_nrrd_header,
+    ".mha": read_metaimage_header,
+    ".mhd": read_metaimage_header,
+}
+INT16 = np.iinfo(np.int16)
 
 
 def read_volume(path: str | os.PathLike[str], name: str | None = None) -> Volume:
@@ -35,8 +48,9 @@ def read_volume(path: str | os.PathLike[str], name: str | None = None) -> Volume
         the image with axes closest to R, A, S; int16 or float32 values as stored, in Hounsfield units for a CT.
 
     Raises:
-        StudyError: missing file, unknown format, truncated file, not 3-D, spacing or orientation missing, axes not
-            orthogonal, or (DICOM) several series, missing slices or gantry tilt.
+        StudyError: missing file, unknown format, truncated or damaged file, not 3-D, a header whose spacing, unit,
+            origin or orientation is missing or contradicts itself, axes not orthogonal, or (DICOM) several series,
+            missing or damaged slices or gantry tilt.
     """
     path = Path(path)
     name = name or path.name
@@ -44,28 +58,38 @@ def read_volume(path: str | os.PathLike[str], name: str | None = None) -> Volume
         raise StudyError(f"{name}: expected a file or DICOM folder at {path}, got nothing there; check the path")
     if path.is_dir():
         image = read_dicom(path, name)
-    elif path.name.lower().endswith(SUFFIXES):
-        check_header(path, name)
-        image = _read_image(path, name)
-    else:
+        values = sitk.GetArrayFromImage(image).T  # SimpleITK hands out (k, j, i)
+        spacing, origin = np.array(image.GetSpacing()), np.array(image.GetOrigin())
+        return _to_ras(values, spacing, np.array(image.GetDirection()).reshape(3, 3), origin, name)
+    suffix = next((suffix for suffix in HEADERS if path.name.lower().endswith(suffix)), None)
+    if suffix is None:
         raise StudyError(
-            f"{name}: expected {', '.join(SUFFIXES)} or a DICOM folder, got {path.suffix!r}; convert the file"
+            f"{name}: expected {', '.join(HEADERS)} or a DICOM folder, got {path.suffix!r}; convert the file"
         )
-    return _to_ras(image, name)
+    stored = HEADERS[suffix](path, name)
+    values = read_pixels(stored, name)
+    return _to_ras(values, *itk_geometry(path, stored.shape, name), name)
 
 
 def read_labels(path: str | os.PathLike[str], like: Volume | None = None, name: str | None = None) -> Volume:
     """Read a label volume (integer ids, int16), on the grid of ``like`` when that is given.
 
     Raises:
-        StudyError: as `read_volume`; values that are not whole numbers; a grid that is not the CT's.
+        StudyError: as `read_volume`; values that are not whole numbers or beyond int16; a grid that is not the CT's.
     """
     labels = read_volume(path, name)
     values = labels.values
     if not np.issubdtype(values.dtype, np.integer):
-        if not (values == np.round(values)).all():
+        with np.errstate(invalid="ignore"):
+            whole = bool((values == np.round(values)).all())
+        if not whole:
             raise StudyError(
-                f"{labels.name}: expected whole label ids, got fractions; resample labels by nearest neighbour"
+                f"{labels.name}: expected whole label ids, got fractions or NaN; resample labels by nearest neighbour"
+            )
+        if values.min() < INT16.min or values.max() > INT16.max:  # a cast would wrap them to other ids
+            raise StudyError(
+                f"{labels.name}: expected label ids of {INT16.min} to {INT16.max}, got {values.min():g} to"
+                f" {values.max():g}; is this an image, not labels?"
             )
         values = values.astype(np.int16)
     labels = labels.with_values(values)
@@ -115,7 +139,7 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> Path:
     """
     path = Path(path)
     if not path.name.endswith(".nii.gz"):
-        raise StudyError(f"expected a name ending in .nii.gz, got {path.name!r}")
+        raise StudyError(f"expected a name ending in .nii.gz, got {path.name!r}; rename it")
     image = sitk.GetImageFromArray(np.ascontiguousarray(volume.values.T))
     image.SetSpacing(volume.spacing_mm.tolist())
     image.SetOrigin((LPS_TO_RAS @ volume.T_ras_index.translation).tolist())
@@ -145,19 +169,11 @@ def check_same_grid(labels: Volume, ct: Volume) -> None:
         )
 
 
-def _read_image(path: Path, name: str) -> sitk.Image:
-    try:
-        return sitk.ReadImage(str(path))
-    except RuntimeError as error:
-        raise explain(error, name) from error
-
-
-def _to_ras(image: sitk.Image, name: str) -> Volume:
-    if image.GetDimension() != 3 or min(image.GetSize()) < 2:
-        raise StudyError(f"{name}: expected a 3-D image, got {image.GetSize()}; give the whole series, one time point")
-    values = sitk.GetArrayFromImage(image).T  # SimpleITK hands out (k, j, i)
-    spacing = np.array(image.GetSpacing())
-    axes: Floats = LPS_TO_RAS @ np.array(image.GetDirection()).reshape(3, 3)  # column: where an index axis points
+def _to_ras(values: NDArray[Any], spacing: Floats, axes_lps: Floats, origin_lps: Floats, name: str) -> Volume:
+    """Values (i, j, k) on a grid in LPS+, turned to the axes closest to R, A, S; axes are the matrix's columns."""
+    if values.ndim != 3 or min(values.shape) < 2:
+        raise StudyError(f"{name}: expected a 3-D image, got {values.shape}; give the whole series, one time point")
+    axes: Floats = LPS_TO_RAS @ axes_lps
     if not np.allclose(axes.T @ axes, np.eye(3), atol=ORTHOGONAL_ATOL):
         raise StudyError(
             f"{name}: expected orthogonal axes, got a sheared grid (gantry tilt?); resample it to an orthogonal grid"
@@ -165,7 +181,7 @@ def _to_ras(image: sitk.Image, name: str) -> Volume:
     if (spacing <= 0).any() or not np.isfinite(spacing).all():
         raise StudyError(f"{name}: expected a positive voxel spacing, got {spacing}; repair the header")
     _, order = linear_sum_assignment(-np.abs(axes))  # row r is best served by index axis order[r]
-    origin = LPS_TO_RAS @ np.array(image.GetOrigin())
+    origin = LPS_TO_RAS @ origin_lps
     values, spacing, axes = values.transpose(order), spacing[order], axes[:, order]
     for axis in range(3):
         if axes[axis, axis] < 0:
