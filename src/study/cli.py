@@ -217,6 +217,8 @@ def register(ct: Path, us: Path, method: str, waypoints: Path | None, seed: int,
     path = None if waypoints is None else read_waypoints(waypoints)
     result = register_pair(read_ply(ct), read_ply(us), method=method, seed=seed)
     moved = None if path is None else result.transfer(path)
+    for old in ("registration.json", "warped.ply", "waypoints_us.csv"):  # of another registration
+        (out / old).unlink(missing_ok=True)
     for line in write_registration(result, moved, out):
         click.echo(line)
     for warning in [*result.warnings, *([] if result.converged else [f"not converged: {result.stop_reason}"])]:
@@ -265,7 +267,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except BrokenPipeError:  # whoever read the output has gone: `study data list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return 141  # as a shell says of SIGPIPE; 1 is what `study compare` says of runs that differ
     except OSError as error:
         click.echo(f"study: expected a file or folder that can be read and written, got {error}", err=True)
         return 2

@@ -46,7 +46,9 @@ def test_of_a_file_cut_anywhere_the_whole_lines_count_and_more_can_follow(tmp_pa
         journal = Journal(path, BASIS)
         assert [journal.get(facts) for facts in FACTS] == [*PIECES[:n_whole], *[None] * (3 - n_whole)]
         journal.keep(FACTS[2], PIECES[2])
+        journal.keep(FACTS[2], PIECES[2])
         assert Journal(path, BASIS).get(FACTS[2]) == PIECES[2]
+        assert path.read_bytes().count(b"\n") == min(n_whole + 1, 3)
 
 
 def test_a_damaged_line_is_not_believed_nor_what_follows(tmp_path: Path) -> None:

@@ -110,7 +110,8 @@ def attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:
         except StudyError as error:
             failure = StudyError(str(error))
         except (Exception, SystemExit) as error:  # a bug in one case, here or in a library, is no reason to lose others
-            failure = StudyError(f"{type(error).__name__}: {error}")  # the error itself may not survive the way back
+            told = f": {error}" if str(error) else ""
+            failure = StudyError(type(error).__name__ + told)  # the error itself may not survive the way back
             trace = traceback.format_exc()
     return Outcome(value, failure, trace, time.perf_counter() - start)
 

@@ -44,8 +44,10 @@ class Journal:
         return self._pieces.get(self._key(facts))
 
     def keep(self, facts: Mapping[str, Any], piece: Mapping[str, Any]) -> None:
-        """Keep a finished piece: JSON, finite numbers in full precision."""
+        """Keep a finished piece: JSON, finite numbers in full precision. What is kept already stays as it is."""
         key = self._key(facts)
+        if key in self._pieces:
+            return
         self._pieces[key] = piece
         if self._path is None:
             return
