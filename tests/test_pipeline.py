@@ -186,3 +186,59 @@ def test_an_answer_that_is_none_is_refused(spoil, message):
 def test_an_answer_for_other_points_is_refused():
     with pytest.raises(StudyError, match="toy: expected one warped point per point of"):
         run_toy(lambda result: replace(result, source=result.source[1:], warped=result.warped[1:]))
+
+
+# --- hostile input: right, refused or warned, never wrong in silence -------------------------------------------------
+
+
+def waypoint_error(ct, us, **options) -> float:
+    """Mean true error (mm) of ct1's waypoints in the patient, phantoms of cohort seed 0 in their canonical pose."""
+    people = [phantom.draw_subject(name, 0) for name in ("ct1", "patient")]
+    path = phantom.waypoints(people[0]).points
+    pair = register_pair(ct, us, **options)
+    assert pair.warnings == ()
+    return float(np.linalg.norm(pair.transfer(path) - phantom.truth_map(*people, path), axis=1).mean())
+
+
+def test_places_given_more_often_do_not_weigh_more(ct_clouds, us_cloud):
+    ct, us = ct_clouds["ct1"].points, us_cloud.points
+    rng = np.random.default_rng(8)
+    plain = waypoint_error(ct, us)
+    half = us[us[:, 0] > np.median(us[:, 0])]
+    assert waypoint_error(ct, np.concatenate([us, *[half] * 7])) == pytest.approx(plain, abs=1.5)
+    patch = ct[np.linalg.norm(ct - ct[100], axis=1) < 12.5]
+    dense = [patch + rng.normal(scale=0.2, size=patch.shape) for _ in range(20)]
+    assert waypoint_error(np.concatenate([ct, *dense]), us) == pytest.approx(plain, abs=1.5)
+
+
+def test_every_given_point_has_its_row_however_many_there_are():
+    people = [phantom.draw_subject(name, 0) for name in ("ct1", "patient")]
+    rng = np.random.default_rng(9)
+    us = phantom.anterior_cloud(people[1], 4000, 0.5, 2, rng).points
+    errors = []
+    for n in (2000, 60_000):
+        ct = phantom.reference_cloud(people[0], n, rng).points
+        pair = register_pair(ct, us)
+        assert np.array_equal(pair.source, ct)
+        truth = phantom.truth_map(*people, ct)
+        errors.append(np.linalg.norm(pair.warped - truth, axis=1).mean())
+    assert errors[0] == pytest.approx(errors[1], abs=1.0)
+
+
+def test_a_rigid_answer_stays_rigid_on_points_that_were_thinned(ct_clouds, us_cloud):
+    doubled = np.concatenate([ct_clouds["ct1"].points] * 2)
+    pair = register_pair(doubled, us_cloud.points, "icp")
+    assert pair.warped == pytest.approx(pair.T_us_ct.apply(doubled), abs=1e-6)
+
+
+def test_a_front_is_heeded_and_one_the_branches_contradict_refused(ct_clouds, us_cloud):
+    ct, us = ct_clouds["ct1"].points, us_cloud.points
+    with_front = register_pair(ct, us, "coarse", front=[0, 2.0, 0])
+    assert np.array_equal(with_front.warped, register_pair(ct, us, "coarse").warped)
+    handed_on = register_pair(ct, PointCloud(us, front=np.array([0, 1.0, 0])), "coarse")
+    assert np.array_equal(with_front.warped, handed_on.warped)
+    with pytest.raises(StudyError, match="us: expected cartilages that arch towards the `front` given"):
+        register_pair(ct, us, "coarse", front=[0, -1, 0])
+    for bad in ([0, 0, 0], [np.nan, 1, 0], [0, 1], "up"):
+        with pytest.raises(StudyError, match="expected front as a direction"):
+            register_pair(ct, us, "coarse", front=bad)

@@ -201,28 +201,48 @@ def compare(reference: Path, candidate: Path) -> None:
     click.get_current_context().exit(comparison.exit_code)
 
 
-@cli.command()
+@cli.command(short_help="Register two clouds of one's own.")
 @click.argument("ct", type=click.Path(path_type=Path))
 @click.argument("us", type=click.Path(path_type=Path))
 @click.option("--method", default="skeleton_graph", show_default=True)
 @click.option("--waypoints", type=click.Path(path_type=Path), help="CSV with columns x, y, z: mm in the CT frame.")
+@click.option(
+    "--radius",
+    default=20.0,
+    show_default=True,
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MM",
+    help="Sphere around a waypoint whose points carry it.",
+)
+@click.option("--front", metavar="X,Y,Z", help="Direction from the chest to the probe, in the frame of US.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of results.")
-def register(ct: Path, us: Path, method: str, waypoints: Path | None, seed: int, out: Path) -> None:
-    """Register two clouds of one's own (PLY, mm, any rigid pose)."""
+def register(
+    ct: Path, us: Path, method: str, waypoints: Path | None, radius: float, front: str | None, seed: int, out: Path
+) -> None:
+    """Register two clouds of one's own (PLY, mm, any rigid pose): sternum and cartilages 2-5, nothing else."""
     from study.files.clouds import read_ply, read_waypoints, write_registration
     from study.pipeline import find_method, register_pair
 
     find_method(method)
     path = None if waypoints is None else read_waypoints(waypoints)
-    result = register_pair(read_ply(ct), read_ply(us), method=method, seed=seed)
-    moved = None if path is None else result.transfer(path)
-    for old in ("registration.json", "warped.ply", "waypoints_us.csv"):  # of another registration
-        (out / old).unlink(missing_ok=True)
-    for line in write_registration(result, moved, out):
+    towards = None if front is None else _direction(front)
+    result = register_pair(read_ply(ct), read_ply(us), method=method, seed=seed, front=towards)
+    for line in write_registration(result, out, path, radius):
         click.echo(line)
     for warning in [*result.warnings, *([] if result.converged else [f"not converged: {result.stop_reason}"])]:
         click.echo(f"study: warning: {warning}", err=True)
+
+
+def _direction(text: str) -> list[float]:
+    """Three numbers of an option."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3:
+        raise StudyError(f"--front: expected three numbers as in 0,1,0, got {text!r}; give it as X,Y,Z")
+    return numbers
 
 
 @cli.command(short_help="Cartilage cloud of a CT of one's own.")

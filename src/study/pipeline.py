@@ -7,18 +7,28 @@ from time import perf_counter
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from study.alignment.chest import Alignment, align
+from study.alignment.sizes import size_warnings
 from study.errors import StudyError
+from study.geometry.points import principal_axes, unit
 
 # The methods import these, and with them Open3D, trimesh and pycpd, on first use. Whoever runs methods, here or in a
 # batch, loads them before: a limit of threads holds only for the pools that are there when it is set, and Open3D brings
 # one; nor does the clock measure an import.
 from study.methods import METHODS, drift, mesh  # noqa: F401
+from study.methods.visible_surface import carry
+from study.quality import QUALITY_LIMITS, SWAPPED, measure_quality, quality_warnings
 from study.registration import Method, Registration
 from study.seeds import named_rng
 from study.types import PointCloud, as_points
+from study.ultrasound.cloud import SweepCloud, thin_evenly
+
+MIN_SPACING_MM = 1.5  # of the points that a method sees; a cartilage is 10 mm wide
+EVEN_SHARE = 0.7  # of the typical distance to the nearest neighbour: random scatter keeps most of its points
+CARRIERS = 8  # points a method saw, whose rigid motion carries a given one
 
 
 def find_method(name: str) -> Method:
@@ -33,21 +43,31 @@ def find_method(name: str) -> Method:
 
 
 def register_pair(
-    ct_points: ArrayLike, us_points: ArrayLike, method: str = "skeleton_graph", seed: int = 0
+    ct: ArrayLike | PointCloud,
+    us: ArrayLike | PointCloud | SweepCloud,
+    method: str = "skeleton_graph",
+    seed: int = 0,
+    front: ArrayLike | None = None,
 ) -> Registration:
     """Register a CT cartilage cloud to a US cartilage cloud (sec. III).
 
+    Both clouds are thinned to an even density first, so that places given more often do not weigh more.
+
     Args:
-        ct_points: (n, 3) mm, sternum and cartilages 2-5 of both sides, any rigid pose.
-        us_points: (m, 3) mm, the same anatomy as ultrasound sees it, any rigid pose.
+        ct: (n, 3) mm, sternum and cartilages 2-5 of both sides, any rigid pose.
+        us: (m, 3) mm, the same anatomy as ultrasound sees it, any rigid pose.
         method: a name in ``METHODS``.
         seed: draws of the method.
+        front: (3,) direction from the chest to the probe in the US frame, where it is known; a swept cloud's own when
+            None. Branches that arch the other way are refused.
 
     Returns:
-        the registration: ``warped`` (n, 3) mm in the US cloud's frame, ``transfer`` for waypoints.
+        the registration: ``warped`` (n, 3) mm in the US cloud's frame, one row per given CT point, ``transfer`` for
+        waypoints, ``quality`` and ``warnings``. An answer with a warning should not guide a probe.
 
     Raises:
-        StudyError: bad arrays, no sternum, a missing branch, an unknown method, or a method that failed.
+        StudyError: bad arrays, no sternum, a missing branch, sizes that no chest has, an unknown method, or a method
+            that failed.
 
     Two made-up people, and where the second one's ultrasound frame has the first one's waypoints:
 
@@ -57,15 +77,46 @@ def register_pair(
         >>> person, patient = phantom.draw_subject("ct1", 0), phantom.draw_subject("patient", 0)
         >>> ct = phantom.reference_cloud(person, 3000, rng).points
         >>> us = phantom.anterior_cloud(patient, 2000, 0.5, 0, rng).points
-        >>> pair = register_pair(ct, us, "icp")
-        >>> pair.warped.shape, pair.stop_reason
-        ((3000, 3), 'iteration limit of 30 reached')
+        >>> pair = register_pair(ct, us, "icp", front=[0, 1, 0])
+        >>> pair.warped.shape, pair.stop_reason, pair.warnings
+        ((3000, 3), 'iteration limit of 30 reached', ())
         >>> pair.transfer(phantom.waypoints(person).points).shape
         (20, 3)
     """
     chosen = find_method(method)
-    alignment = align(PointCloud(as_points(ct_points, "ct"), "ct"), PointCloud(as_points(us_points, "us"), "us"))
-    return register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
+    given, seen = _as_cloud(ct, "ct"), _as_cloud(us, "us", front)
+    alignment = align(_evened(given), _evened(seen))
+    result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
+    if len(alignment.source.cloud) == len(given):
+        return result
+    return replace(result, source=given.points, warped=carry(given.points, result.source, result.warped, CARRIERS))
+
+
+def _as_cloud(given: ArrayLike | PointCloud | SweepCloud, name: str, front: ArrayLike | None = None) -> PointCloud:
+    """An unlabelled cloud of what was given, under the name that messages call it."""
+    if isinstance(given, SweepCloud):
+        given = replace(given.cloud, front=given.front)
+    known = given.front if isinstance(given, PointCloud) else None
+    points = given.points if isinstance(given, PointCloud) else as_points(given, name)
+    return PointCloud(points, name, front=known if front is None else unit(front, "front"))
+
+
+def _evened(cloud: PointCloud) -> PointCloud:
+    """The cloud thinned to an even density; the points themselves where they are even.
+
+    What is denser than its surroundings is thinned to the spacing that is typical by area: by number, a patch sampled
+    20 times would be typical of the whole.
+    """
+    centre, axes = principal_axes(cloud.points)
+    local = (cloud.points - centre) @ axes.T  # so that a moved cloud keeps the same points
+    thinned = thin_evenly(local, MIN_SPACING_MM)
+    spacing, _ = KDTree(thinned).query(thinned, k=[2])
+    ordered = np.sort(spacing[:, 0])
+    area = np.cumsum(ordered**2)
+    spacing_mm = EVEN_SHARE * float(ordered[np.searchsorted(area, area[-1] / 2)])
+    if spacing_mm > MIN_SPACING_MM:
+        thinned = thin_evenly(local, spacing_mm)
+    return cloud if len(thinned) == len(cloud) else replace(cloud, points=thinned @ axes + centre)
 
 
 def register_aligned(
@@ -84,9 +135,18 @@ def register_aligned(
     Raises:
         StudyError: as `run_method`.
     """
+    suspect = size_warnings(alignment)
     source, T0 = alignment.source.cloud, alignment.T_us_ct
     result = run_method(method, source.moved(T0), alignment.target.cloud, rng, name)
-    return replace(result, source=source.points, T_us_ct=result.T_us_ct @ T0)
+    quality = measure_quality(alignment, result.warped)
+    return replace(
+        result,
+        source=source.points,
+        T_us_ct=result.T_us_ct @ T0,
+        quality=quality,
+        warnings=(*suspect, *result.warnings, *quality_warnings(quality)),
+        converged=result.converged and quality.wrong_part_share <= QUALITY_LIMITS[SWAPPED][0],
+    )
 
 
 def run_method(

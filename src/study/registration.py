@@ -12,14 +12,29 @@ from scipy.spatial import KDTree
 from study import preview
 from study.errors import StudyError
 from study.geometry.points import fit_rigid
+from study.quality import Quality
 from study.types import Floats, PointCloud, RigidTransform, as_points
 
 MIN_SUPPORT = 3  # points that hold a rigid motion
 MIN_WIDTH_MM = 1e-6  # second singular value of points that lie on a line but for rounding
+MIN_PATH_MM = 1.0  # extent of a path; one in metres is a fraction of a millimetre across
 
 
-def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radius_mm: float = 20.0) -> Floats:
-    """Move each waypoint by the rigid fit of the cloud points around it (sec. III-D).
+@dataclass(frozen=True)
+class CarriedPath:
+    """Waypoints after path transfer, the bad ones told apart from the good.
+
+    Attributes:
+        points: (k, 3) mm in the US frame; NaN where a waypoint could not be carried.
+        reasons: (k,) why not, ``""`` for a good one.
+    """
+
+    points: Floats
+    reasons: tuple[str, ...]
+
+
+def carry_path(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radius_mm: float = 20.0) -> CarriedPath:
+    """Move each waypoint by the rigid fit of the cloud points around it (sec. III-D), a bad one for itself.
 
     Args:
         source: (n, 3) mm, CT.
@@ -27,18 +42,8 @@ def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radi
         waypoints: (k, 3) mm, CT.
         radius_mm: sphere around each waypoint; 20 mm in the paper.
 
-    Returns:
-        (k, 3) mm in the US frame.
-
     Raises:
-        StudyError: clouds that do not pair, or a sphere with fewer than 3 points or with points on a line.
-
-    A breath lifts this wall by 5 mm and widens it by 2 %; a waypoint behind it goes along:
-
-        >>> import numpy as np
-        >>> wall = np.random.default_rng(0).uniform([-60, -5, -60], [60, 5, 60], (2000, 3))
-        >>> transfer(wall, wall * [1.02, 1, 1] + [0, 5, 0], [[50, -10, 20]]).round(1)
-        array([[51., -5., 20.]])
+        StudyError: clouds that do not pair, a radius that is none, or waypoints in metres.
     """
     waypoints = as_points(waypoints, "waypoints")
     source, warped = as_points(source, "source"), as_points(warped, "warped")
@@ -47,18 +52,49 @@ def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radi
             f"expected one warped point per source point, got {source.shape} and {warped.shape}; "
             "pass both clouds of one registration"
         )
-    if not radius_mm > 0:
+    if not 0 < radius_mm < np.inf:
         raise StudyError(f"expected radius_mm > 0, got {radius_mm}; the paper's is 20")
-    moved = np.empty_like(waypoints)
+    extent = float(np.linalg.norm(np.ptp(waypoints, axis=0)))
+    if 0 < extent < MIN_PATH_MM:
+        raise StudyError(
+            f"waypoints: expected a path in millimetres, got {len(waypoints)} points {extent:.2g} mm across; metres? "
+            "multiply by 1000"
+        )
+    moved, reasons = np.full_like(waypoints, np.nan), []
     for k, members in enumerate(KDTree(source).query_ball_point(waypoints, radius_mm)):
         local = source[members]
         if len(members) < MIN_SUPPORT or _on_a_line(local):
-            raise StudyError(
-                f"waypoint {k}: expected at least {MIN_SUPPORT} CT points off a line within {radius_mm:g} mm, "
-                f"got {len(members)}; check that it lies between the cartilages, or raise radius_mm"
+            reasons.append(
+                f"expected at least {MIN_SUPPORT} CT points off a line within {radius_mm:g} mm, got {len(members)}; "
+                "check that it lies between the cartilages, or raise the radius"
             )
+            continue
         moved[k] = fit_rigid(local, warped[members]).apply(waypoints[k : k + 1])[0]
-    return moved
+        reasons.append("")
+    return CarriedPath(moved, tuple(reasons))
+
+
+def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radius_mm: float = 20.0) -> Floats:
+    """`carry_path` of waypoints that must all be good (sec. III-D).
+
+    Returns:
+        (k, 3) mm in the US frame.
+
+    Raises:
+        StudyError: what `carry_path` refuses, or a sphere with fewer than 3 points or with points on a line.
+
+    A breath lifts this wall by 5 mm and widens it by 2 %; a waypoint behind it goes along:
+
+        >>> import numpy as np
+        >>> wall = np.random.default_rng(0).uniform([-60, -5, -60], [60, 5, 60], (2000, 3))
+        >>> transfer(wall, wall * [1.02, 1, 1] + [0, 5, 0], [[50, -10, 20]]).round(1)
+        array([[51., -5., 20.]])
+    """
+    path = carry_path(source, warped, waypoints, radius_mm=radius_mm)
+    for number, reason in enumerate(path.reasons):
+        if reason:
+            raise StudyError(f"expected waypoints that can all be carried, got waypoint {number}: {reason}")
+    return path.points
 
 
 def _on_a_line(points: Floats) -> bool:
@@ -73,14 +109,16 @@ class Registration:
     Attributes:
         source: (n, 3) mm, the CT points as given.
         warped: (n, 3) mm, row i is ``source[i]`` in the target (US) frame.
-        T_us_ct: the rigid part: the whole answer of a rigid method, the coarse alignment of a non-rigid one.
+        T_us_ct: the rigid part only: the whole answer of a rigid method, the coarse alignment of a non-rigid one. Not
+            what a robot should follow; `transfer` is.
         converged: False when the iteration limit or the end of a schedule came before the method was at rest.
         n_iterations: iterations (epochs) run.
         stop_reason: why it stopped, in words.
         history: figures of progress, in order; what they are and how often depends on the method.
         seconds: wall time of the method; `study.pipeline.run_method` sets it, and
         method: the name it ran under.
-        warnings: what a careful reader should know about this result.
+        warnings: sentences, each on one thing that makes the answer suspect; empty when nothing does.
+        quality: measures of the result that need no truth; `study.pipeline.register_aligned` sets both.
 
     A notebook shows one as a few lines and a picture. Its verb is path transfer:
 
@@ -103,6 +141,7 @@ class Registration:
     seconds: float = 0.0
     method: str = ""
     warnings: tuple[str, ...] = ()
+    quality: Quality | None = None
 
     def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
         """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits (sec. III-D).

@@ -72,8 +72,10 @@ def test_the_foot_is_where_the_branches_bend_and_reach_most(sign, at_high_y):
     assert foot.bend_ratio > 3.0
     assert foot.length_ratio > 1.5
     assert branch_lengths_mm(branches, local)[[0, 3]] == pytest.approx([55.0, 30.0][::-sign], abs=2.0)
-    assert find_front(branches, local, None, "toy") > 0.2
-    assert find_front(branches, local * [1, 1, -1], None, "toy") < -0.2
+    looks_to_front, arch_mm = find_front(branches, local, None, "toy")
+    assert looks_to_front
+    assert arch_mm > 0.2
+    assert find_front(branches, local * [1, 1, -1], None, "toy") == (False, pytest.approx(arch_mm))
 
 
 def test_a_long_branch_that_does_not_bend_contradicts_the_foot():
@@ -83,9 +85,14 @@ def test_a_long_branch_that_does_not_bend_contradicts_the_foot():
         find_foot(branches, local, "toy")
 
 
-def test_a_given_front_overrules_the_arch_but_may_not_lie_in_the_plane():
+def test_a_given_front_decides_but_may_not_contradict_the_arch_or_lie_in_the_plane():
     branches, local = drawn({"reach": 70.0}, {"reach": 45.0})
-    assert find_front(branches, local, -0.7, "toy") == -0.7
+    _, arch_mm = find_front(branches, local, None, "toy")
+    assert find_front(branches, local, 0.7, "toy") == (True, pytest.approx(arch_mm))
+    assert find_front(branches, local * [1, 1, -1], -0.7, "toy") == (False, pytest.approx(arch_mm))
+    assert find_front(branches, local * [1, 1, 0], -0.7, "toy") == (False, pytest.approx(0.0))
+    with pytest.raises(StudyError, match=r"toy: expected cartilages that arch towards the `front` given, got .* away"):
+        find_front(branches, local, -0.7, "toy")
     with pytest.raises(StudyError, match=r"toy: expected a `front` across the feature plane .* got 0\.10"):
         find_front(branches, local, MIN_FRONT_COSINE / 2, "toy")
     with pytest.raises(StudyError, match="toy: expected cartilages that arch"):

@@ -4,13 +4,14 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
 from study.errors import StudyError
 from study.files.clouds import read_ply, read_waypoints, write_ply, write_registration
 from study.registration import Registration
-from study.types import PointCloud, RigidTransform
+from study.types import PointCloud, RigidTransform, Waypoints
 
 POINTS = np.random.default_rng(5).normal([0.0, -900.0, 1200.0], 60.0, size=(400, 3))
 
@@ -53,7 +54,7 @@ def test_missing_files_and_nan_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match=r"none\.csv"):
         read_waypoints(tmp_path / "none.csv")
     (tmp_path / "nan.csv").write_text("x,y,z\n1,2,3\n1,,3\n")
-    with pytest.raises(StudyError, match=r"nan\.csv: expected finite numbers, got 1 row"):
+    with pytest.raises(StudyError, match=r"nan\.csv: expected finite numbers .* got others in line 3"):
         read_waypoints(tmp_path / "nan.csv")
     (tmp_path / "words.csv").write_text("x,y,z\n1,two,3\n")
     with pytest.raises(StudyError, match=r"words\.csv"):
@@ -68,7 +69,14 @@ def test_missing_files_and_nan_are_refused(tmp_path: Path) -> None:
 
 def test_waypoints_are_taken_by_column_name(tmp_path: Path) -> None:
     (tmp_path / "w.csv").write_text("name,z,y,x\nR2-3.1,3,2,1\nR2-3.2,6,5,4\n")
-    assert read_waypoints(tmp_path / "w.csv").tolist() == [[1, 2, 3], [4, 5, 6]]
+    path = read_waypoints(tmp_path / "w.csv")
+    assert path.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert path.labels == ("line 2", "line 3")
+
+
+def test_waypoints_keep_their_labels_and_count_as_the_file_does(tmp_path: Path) -> None:
+    (tmp_path / "w.csv").write_text("label,x,y,z\nR2-3.1,1,2,3\n\n,4,5,6\n")
+    assert read_waypoints(tmp_path / "w.csv").labels == ("R2-3.1", "line 4")
 
 
 def test_another_suffix_is_refused_before_anything_is_written(tmp_path: Path) -> None:
@@ -80,8 +88,8 @@ def test_another_suffix_is_refused_before_anything_is_written(tmp_path: Path) ->
 def test_a_registration_is_written_whole(tmp_path: Path) -> None:
     T = RigidTransform.random(np.random.default_rng(1))
     result = Registration(POINTS, T.apply(POINTS), T, False, 7, "iteration limit", warnings=("few points",))
-    moved = T.apply(POINTS[:4])
-    lines = write_registration(result, moved, tmp_path / "out")
+    path = Waypoints(POINTS[:4], tuple(f"line {k + 2}" for k in range(4)))
+    lines = write_registration(result, tmp_path / "out", path, radius_mm=60.0)
     assert {entry.name for entry in (tmp_path / "out").iterdir()} == {
         "warped.ply", "registration.json", "waypoints_us.csv"
     }  # fmt: skip
@@ -92,7 +100,26 @@ def test_a_registration_is_written_whole(tmp_path: Path) -> None:
     assert (summary["converged"], summary["warnings"]) == (False, ["few points"])
     header, *rows = (tmp_path / "out" / "waypoints_us.csv").read_text(encoding="utf-8").splitlines()
     assert header == "x,y,z"
-    assert np.array_equal([[float(value) for value in row.split(",")] for row in rows], moved)
+    moved = [[float(value) for value in row.split(",")] for row in rows]
+    assert np.allclose(moved, T.apply(POINTS[:4]), rtol=0, atol=1e-9)
+
+
+def test_a_bad_waypoint_is_flagged_and_the_good_ones_survive(tmp_path: Path) -> None:
+    T = RigidTransform.random(np.random.default_rng(1))
+    result = Registration(POINTS, T.apply(POINTS), T, True, 7, "at rest")
+    path = Waypoints(np.vstack([POINTS[:1], [[9e3, 0, 0]], POINTS[1:2]]), ("R2-3.1", "far", "R2-3.2"))
+    lines = write_registration(result, tmp_path / "out", path, radius_mm=60.0)
+    assert lines[-1].startswith("waypoint not carried: far: expected at least 3 CT points")
+    table = pd.read_csv(tmp_path / "out" / "waypoints_us.csv", keep_default_na=False, na_values={"x": ""})
+    assert table["label"].to_list() == ["R2-3.1", "far", "R2-3.2"]
+    assert table["x"].isna().to_list() == [False, True, False]
+    assert [bool(reason) for reason in table["reason"]] == [False, True, False]
+    warnings = json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))["warnings"]
+    assert len(warnings) == 1
+    assert "far" in warnings[0]
+    with pytest.raises(StudyError, match="expected one or more that can be carried, got none: far"):
+        write_registration(result, tmp_path / "none", Waypoints(path.points[1:2], ("far",)))
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

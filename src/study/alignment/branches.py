@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from sklearn.cluster import KMeans
 
+from study.alignment.sternum import CROP
 from study.errors import StudyError
 from study.geometry.points import close_gaps, pixelise, sample_spacing_mm
 from study.types import Bools, Floats, Ints
@@ -163,7 +164,7 @@ def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> list[Floa
         return found
     raise StudyError(
         f"{name}: expected 4 separate cartilages at the {where} of the sternum as seen from one face, got fewer; "
-        "is a branch missing, or do two touch along their length?"
+        f"{CROP}; if it is so cropped, is a branch missing, or do two touch along their length?"
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from study.alignment.branches import Branches, find_branches
 from study.alignment.orientation import find_foot, find_front, sternum_front_mm
 from study.alignment.roots import RootMeasures, check_roots, measure_roots
-from study.alignment.sternum import SternumFit, SternumParams, feature_plane, sternum_candidates, symmetry_axis
+from study.alignment.sternum import CROP, SternumFit, SternumParams, feature_plane, sternum_candidates, symmetry_axis
 from study.errors import StudyError
 from study.types import Floats, Ints, Part, PointCloud, RigidTransform
 
@@ -43,7 +43,7 @@ class Chest:
         sternum_overlap: F_k over the area of the rectangle (Eq. 1).
         bend_ratio: bend of the branches taken as 5th over that of the branches taken as 2nd.
         length_ratio: the same of their lengths beside the sternum.
-        bulge_mm: mean arch of the branches towards the front; of a cloud that knows its front, its cosine with z.
+        bulge_mm: mean arch of the branches towards the front.
         search: how they were found.
     """
 
@@ -92,9 +92,9 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
     # front and foot
     branches, local = search.branches, T_cloud_sternum.inverse.apply(cloud.points)
     known = None if cloud.front is None else float(cloud.front @ T_cloud_sternum.rotation[:, 2])
-    towards_front = find_front(branches, local, known, cloud.name)
+    looks_to_front, arch_mm = find_front(branches, local, known, cloud.name)
     foot = find_foot(branches, local, cloud.name)
-    T_cloud_sternum, numbers = _turn_upright(T_cloud_sternum, branches.branch, towards_front < 0, foot.at_high_y)
+    T_cloud_sternum, numbers = _turn_upright(T_cloud_sternum, branches.branch, not looks_to_front, foot.at_high_y)
     # names
     labelled = replace(cloud, parts=_parts_of(numbers))
     depth_mm = sternum_front_mm(T_cloud_sternum.inverse.apply(cloud.points), p)
@@ -105,7 +105,7 @@ def find_chest(cloud: PointCloud, params: SternumParams | None = None) -> Chest:
         sternum_overlap=search.fit.overlap,
         bend_ratio=foot.bend_ratio,
         length_ratio=foot.length_ratio,
-        bulge_mm=abs(towards_front),
+        bulge_mm=arch_mm,
         search=search,
     )
 
@@ -153,7 +153,7 @@ def _sternum_with_branches(flat: Floats, params: SternumParams, name: str) -> tu
         raise first_error
     raise StudyError(
         f"no sternum found in {name!r}: best overlap {best:.2f} of a {params.width_mm:g} × {params.height_mm:g} mm "
-        f"rectangle, need {params.min_overlap:.2f}; check that the cloud holds sternum and cartilages 2-5"
+        f"rectangle, need {params.min_overlap:.2f}; {CROP}"
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from study.alignment.branches import Branches, branch_lengths_mm
-from study.alignment.sternum import SternumParams
+from study.alignment.sternum import CROP, SternumParams
 from study.errors import StudyError
 from study.geometry.points import foremost_in_cells
 from study.types import Floats
@@ -39,36 +39,43 @@ class Foot:
     length_ratio: float
 
 
-def find_front(branches: Branches, local: Floats, front_cosine: float | None, name: str) -> float:
-    """How far z looks to the front: above 0 it does, below 0 it looks to the back.
+def find_front(branches: Branches, local: Floats, front_cosine: float | None, name: str) -> tuple[bool, float]:
+    """Whether z looks to the front, and how clearly: the branches arch towards it.
 
     Args:
         branches: numbers of the points.
         local: (n, 3) mm in sternum coordinates.
-        front_cosine: between z and the front where the cloud knows it, else None.
+        front_cosine: between z and the front where the cloud knows it, which then decides; else None.
         name: what the points are, for messages.
 
     Returns:
-        ``front_cosine``, or without it the mean arch of the eight branches towards z, mm.
+        whether z looks to the front; the mean arch of the eight branches towards the front, mm.
 
     Raises:
-        StudyError: a front that lies in the feature plane, or branches too flat to tell.
+        StudyError: a front that lies in the feature plane or that the branches contradict, or branches too flat to
+            tell.
     """
-    if front_cosine is not None:
-        if abs(front_cosine) < MIN_FRONT_COSINE:
-            raise StudyError(
-                f"{name}: expected a `front` across the feature plane (cosine with its normal {MIN_FRONT_COSINE:g} or "
-                f"more), got {abs(front_cosine):.2f}; check the direction given with the cloud"
-            )
-        return front_cosine
     number = branches.branch
     bulge = float(np.mean([bulge_mm(local[number == k], local[number == 0]) for k in range(1, 9)]))
-    if abs(bulge) < MIN_BULGE_MM:
+    if front_cosine is None:
+        if abs(bulge) < MIN_BULGE_MM:
+            raise StudyError(
+                f"{name}: expected cartilages that arch {MIN_BULGE_MM} mm or more to the front, got "
+                f"{abs(bulge):.2f} mm, so front and back look alike; give the cloud its `front` direction"
+            )
+        return bulge > 0, abs(bulge)
+    if abs(front_cosine) < MIN_FRONT_COSINE:
         raise StudyError(
-            f"{name}: expected cartilages that arch {MIN_BULGE_MM} mm or more to the front, got "
-            f"{abs(bulge):.2f} mm, so front and back look alike; give the cloud its `front` direction"
+            f"{name}: expected a `front` across the feature plane (cosine with its normal {MIN_FRONT_COSINE:g} or "
+            f"more), got {abs(front_cosine):.2f}; check the direction given with the cloud"
         )
-    return bulge
+    towards_front = bulge if front_cosine > 0 else -bulge
+    if towards_front < -MIN_BULGE_MM:
+        raise StudyError(
+            f"{name}: expected cartilages that arch towards the `front` given, got {-towards_front:.2f} mm away from "
+            "it; does it point to the back, or is the cloud mirrored?"
+        )
+    return front_cosine > 0, towards_front
 
 
 def find_foot(branches: Branches, local: Floats, name: str) -> Foot:
@@ -91,8 +98,8 @@ def find_foot(branches: Branches, local: Floats, name: str) -> Foot:
     if length_ratio < MIN_LENGTH_RATIO:
         raise StudyError(
             f"{name}: expected 5th cartilages, those that bend most, to be {MIN_LENGTH_RATIO:g} times as long as "
-            f"the 2nd or more, got {length_ratio:.2f}, so head and foot look alike; is a latency left in, or a "
-            "line of the sweep out of place?"
+            f"the 2nd or more, got {length_ratio:.2f}, so head and foot look alike; {CROP}; if "
+            "it is so cropped, is a latency left in, or a line of the sweep out of place?"
         )
     bend_ratio = max(bend_low, bend_high) / max(min(bend_low, bend_high), 1e-9)
     return Foot(bend_high > bend_low, bend_ratio, length_ratio)

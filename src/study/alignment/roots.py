@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from study.alignment.branches import MAX_OFFSET_MM, Branches, branch_lengths_mm
+from study.alignment.sternum import CROP
 from study.errors import StudyError
 from study.geometry.points import nearest
 from study.types import Floats
@@ -78,18 +79,18 @@ def check_roots(found: RootMeasures, name: str) -> None:
         raise StudyError(
             f"{name}: expected four cartilages a side that leave the sternum in pairs (up to {MAX_OFFSET_MM:g} mm), at "
             f"least {MIN_APART_MM:g} mm apart and {MIN_LENGTH_MM:g} mm long, got {found.offset_mm:.0f}, "
-            f"{found.apart_mm:.0f} and {found.shortest_mm:.0f} mm; is a branch missing, or does the cloud hold more "
-            "than cartilages 2-5?"
+            f"{found.apart_mm:.0f} and {found.shortest_mm:.0f} mm; {CROP}; if it is so cropped, is a branch missing?"
         )
     if found.touch > MAX_TOUCH:
         raise StudyError(
             f"{name}: expected cartilages apart from each other beside the sternum, got {found.touch:.2f} of one in "
-            f"reach ({TOUCH_MM:g} mm) of the next, need {MAX_TOUCH:g} or less; is a branch missing?"
+            f"reach ({TOUCH_MM:g} mm) of the next, need {MAX_TOUCH:g} or less; {CROP}; if it is so cropped, is a "
+            "branch missing?"
         )
     if found.fill > MAX_FILL:
         raise StudyError(
             f"{name}: expected open spaces between the cartilages, got {found.fill:.2f} of their own density there, "
-            f"need {MAX_FILL:g} or less; crop to sternum and cartilages of ribs 2-5"
+            f"need {MAX_FILL:g} or less; {CROP}"
         )
 
 

@@ -13,6 +13,9 @@ from study.errors import StudyError
 from study.geometry.points import close_gaps, pixelise, principal_axes, sample_spacing_mm
 from study.types import Floats, PointCloud, RigidTransform
 
+# What a cloud should hold; the first thing to check where none of it is found.
+CROP = "crop to the sternum from at most 5 mm above the 2nd to below the 5th attachments and cartilages 2-5, no ribs"
+
 
 @dataclass(frozen=True)
 class SternumParams:
@@ -72,7 +75,7 @@ def feature_plane(cloud: PointCloud) -> RigidTransform:
     if spread[1] < 10.0 or spread[2] > 0.6 * spread[1]:
         raise StudyError(
             f"{cloud.name}: expected a chest wall spread over a plane, got principal spreads "
-            f"{spread[0]:.1f}, {spread[1]:.1f}, {spread[2]:.1f} mm; crop to sternum and cartilages of ribs 2-5"
+            f"{spread[0]:.1f}, {spread[1]:.1f}, {spread[2]:.1f} mm; {CROP}"
         )
     return RigidTransform(axes.T, centre)
 

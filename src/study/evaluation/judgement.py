@@ -8,6 +8,7 @@ from functools import cached_property
 from study.errors import StudyError
 from study.evaluation.distances import CloudDistances, point_errors_mm, waypoint_errors_mm
 from study.evaluation.pair import Pair
+from study.quality import Quality, measure_quality
 from study.registration import Registration
 from study.types import Floats
 
@@ -44,6 +45,11 @@ class Judgement:
     def normal(self) -> Floats:
         """(3,) normal of the patient's feature plane, US frame."""
         return self.pair.alignment.target.T_cloud_chest.rotation[:, 2]
+
+    @cached_property
+    def quality(self) -> Quality:
+        """What the registration says about itself, without the truth."""
+        return self.registration.quality or measure_quality(self.pair.alignment, self.registration.warped)
 
     def protocol_errors_mm(self, *, in_plane: bool = False) -> Floats:
         """Distance (k,) of the carried waypoints from those the protocol defines on the US cloud (sec. IV-B)."""

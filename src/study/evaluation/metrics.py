@@ -58,7 +58,8 @@ _WORST = "the worst of thousands of points: one changed partner moves it; method
 _MEAN = "a mean over thousands of points hides a changed partner; methods differ by 0.3 mm and more"
 _PLACE = "a rigid fit of hundreds of points; methods differ by 0.5 mm and more"
 _SHARE = "a percentile ignores single points"
-_MM = Unit.MILLIMETRES
+_COUNT = "a share of thousands of points; a limit stands where right and wrong differ by more"
+_MM, _1 = Unit.MILLIMETRES, Unit.FRACTION
 
 METRICS: Mapping[str, Metric] = MappingProxyType(
     {
@@ -96,6 +97,20 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "true_error_max": Metric(
             "Largest true point error", _MM, 0.2, 0.01, _WORST, lambda j: j.true_point_errors_mm.max(), needs_truth=True
         ),
+        # What a registration says about itself (`study.quality`), where there is no truth to ask.
+        "residual_share": Metric(
+            "US farther than 5 mm from CT", _1, 0.01, 0.001, _COUNT, lambda j: j.quality.residual_share
+        ),
+        "wrong_part_share": Metric(
+            "On another cartilage than its own", _1, 0.01, 0.001, _COUNT, lambda j: j.quality.wrong_part_share
+        ),
+        "further_motion": Metric(
+            "Motion after the coarse alignment", _MM, 0.05, 0.005, _MEAN, lambda j: j.quality.further_motion_mm
+        ),
+        "stretched_share": Metric(
+            "Neighbours torn or crushed", _1, 0.01, 0.001, _COUNT, lambda j: j.quality.stretched_share
+        ),
+        "folded_share": Metric("Folded over", _1, 0.01, 0.001, _COUNT, lambda j: j.quality.folded_share),
     }
 )
 

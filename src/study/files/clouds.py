@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,8 @@ import trimesh
 
 from study.errors import StudyError
 from study.files.atomic import write_bytes, write_text
-from study.registration import Registration
-from study.types import Floats, PointCloud, as_points
+from study.registration import Registration, carry_path
+from study.types import Floats, PointCloud, Waypoints, as_points
 
 
 def read_ply(path: str | os.PathLike[str]) -> Floats:
@@ -33,20 +34,35 @@ def read_ply(path: str | os.PathLike[str]) -> Floats:
     return as_points(getattr(loaded, "vertices", np.empty((0, 3))), path.name)
 
 
-def read_waypoints(path: str | os.PathLike[str]) -> Floats:
-    """Waypoints (k, 3) mm from a CSV file with columns ``x``, ``y``, ``z``.
+def read_waypoints(path: str | os.PathLike[str]) -> Waypoints:
+    """Waypoints (k, 3) mm from a CSV file with columns ``x``, ``y``, ``z`` and, where there is one, ``label``.
+
+    A waypoint without a label is called by its line in the file, the header being line 1.
 
     Raises:
-        StudyError: no such file, or other columns.
+        StudyError: no such file, other columns, or a place that is no number.
     """
     path = Path(path)
     try:
-        table = pd.read_csv(path)
+        table = pd.read_csv(path, skip_blank_lines=False).dropna(how="all")
     except (OSError, ValueError) as error:
-        raise StudyError(f"expected a CSV file of waypoints at {path}, got: {' '.join(str(error).split())}") from error
+        raise StudyError(
+            f"expected a CSV file of waypoints at {path}, got: {' '.join(str(error).split())}; check the path"
+        ) from error
     if not {"x", "y", "z"} <= set(table.columns):
-        raise StudyError(f"{path.name}: expected columns x, y, z, got {', '.join(map(str, table.columns))}")
-    return as_points(table[["x", "y", "z"]].to_numpy(), path.name)
+        raise StudyError(
+            f"{path.name}: expected columns x, y, z, got {', '.join(map(str, table.columns))}; name them in line 1"
+        )
+    lines = [f"line {number + 2}" for number in table.index]
+    places = table[["x", "y", "z"]].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
+    bad = [line for line, place in zip(lines, places, strict=True) if not np.isfinite(place).all()]
+    if bad:
+        raise StudyError(
+            f"{path.name}: expected finite numbers x, y, z in mm, got others in {', '.join(bad)}; mend them"
+        )
+    if "label" in table.columns:
+        lines = [line if pd.isna(label) else str(label) for line, label in zip(lines, table["label"], strict=True)]
+    return Waypoints(as_points(places, path.name), tuple(lines))
 
 
 def as_ply_path(path: str | os.PathLike[str]) -> Path:
@@ -76,28 +92,55 @@ def write_ply(cloud: PointCloud, path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def write_registration(result: Registration, waypoints_us: Floats | None, folder: Path) -> list[str]:
-    """Write ``warped.ply``, ``registration.json`` and, where given, ``waypoints_us.csv``.
+def write_registration(
+    result: Registration, folder: Path, waypoints: Waypoints | None = None, radius_mm: float = 20.0
+) -> list[str]:
+    """Write ``warped.ply``, ``registration.json`` and, where waypoints are given, ``waypoints_us.csv``.
+
+    A waypoint that cannot be carried keeps its row: empty places and the reason, in a column that is there only then.
+
+    Args:
+        result: a registration.
+        folder: where to write.
+        waypoints: mm, CT frame.
+        radius_mm: sphere of the path transfer (sec. III-D).
 
     Returns:
-        a line for each file, saying what it is.
+        a line for each file, saying what it is, and one for each waypoint that was not carried.
+
+    Raises:
+        StudyError: not one waypoint can be carried; nothing is written.
     """
+    table, told = None, []
+    if waypoints is not None:
+        path = carry_path(result.source, result.warped, waypoints.points, radius_mm=radius_mm)
+        told = [f"{label}: {reason}" for label, reason in zip(waypoints.labels, path.reasons, strict=True) if reason]
+        if len(told) == len(waypoints):
+            raise StudyError(f"waypoints: expected one or more that can be carried, got none: {told[0]}")
+        table = pd.DataFrame(path.points, columns=["x", "y", "z"])
+        if not all(label.startswith("line ") for label in waypoints.labels):
+            table["label"] = waypoints.labels
+        if told:
+            table["reason"] = path.reasons
+    for name in ("registration.json", "waypoints_us.csv"):  # of an earlier registration, which this one is not
+        (folder / name).unlink(missing_ok=True)
     write_ply(PointCloud(result.warped, "warped"), folder / "warped.ply")
     summary = {
         "method": result.method,
-        "T_us_ct": result.T_us_ct.matrix.tolist(),
         "converged": result.converged,
+        "warnings": [*result.warnings, *(f"waypoint not carried: {one}" for one in told)],
+        "quality": None if result.quality is None else asdict(result.quality),
         "n_iterations": result.n_iterations,
         "stop_reason": result.stop_reason,
-        "warnings": list(result.warnings),
+        "T_us_ct": result.T_us_ct.matrix.tolist(),
+        "T_us_ct_is": "the rigid part of the result only, CT frame to US frame, mm; no probe should follow it",
     }
     write_text(folder / "registration.json", json.dumps(summary, indent=2) + "\n")
     lines = [
         f"CT cloud in the US frame, mm: {folder / 'warped.ply'}",
-        f"coarse or rigid transform and how it ended: {folder / 'registration.json'}",
+        f"quality, warnings, rigid part (not for a probe to follow): {folder / 'registration.json'}",
     ]
-    if waypoints_us is not None:
-        table = pd.DataFrame(waypoints_us, columns=["x", "y", "z"]).to_csv(index=False, lineterminator="\n")
-        write_text(folder / "waypoints_us.csv", table)
+    if table is not None:
+        write_text(folder / "waypoints_us.csv", table.to_csv(index=False, lineterminator="\n"))
         lines.append(f"waypoints in the US frame, mm: {folder / 'waypoints_us.csv'}")
-    return lines
+    return [*lines, *(f"waypoint not carried: {one}" for one in told)]

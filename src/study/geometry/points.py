@@ -64,9 +64,12 @@ def unit(vector: ArrayLike, name: str) -> Floats:
     Raises:
         StudyError: not three finite numbers, or all zero.
     """
-    array = np.asarray(vector, dtype=np.float64)
+    try:
+        array = np.asarray(vector, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
     if array.shape != (3,) or not np.isfinite(array).all() or not np.linalg.norm(array) > 0:
-        raise StudyError(f"expected {name} as a direction (3,), got {array}")
+        raise StudyError(f"expected {name} as a direction (3,), got {vector!r}; give three numbers, not all 0")
     return array / np.linalg.norm(array)
 
 
