@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -13,12 +14,13 @@ from phantom_files import SMALL, cached_ct_volume
 
 from study import METHODS as METHODS_BY_NAME
 from study import phantom
-from study.batch import cases, run_dataset, run_study
+from study.batch import cases, open_run, run_dataset, run_parameters, run_study, runs, why_stale
 from study.batch.workers import Outcome, Workers
 from study.datasets import Anatomy, Dataset, PhantomDataset, PlantedDataset, find_dataset
 from study.errors import StudyError
 from study.evaluation.pair import TRUTH
 from study.params import StudyParams
+from study.results.journal import Journal
 from study.results.metrics_csv import FAILED, read_metrics
 
 METHODS = ("coarse", "icp")
@@ -257,6 +259,48 @@ def test_what_another_seed_made_is_not_taken_over(
     monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct1", StudyError("asked for again")))
     with pytest.raises(StudyError, match="asked for again"):
         run_study(people(seed=0), tmp_path / "out", methods=["coarse"])
+
+
+def test_a_finished_case_is_known_by_its_method_and_input_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = cases.Step("ct1", "patient", "icp", "register")
+    journal = Journal(None, {})
+
+    def work(ct: str) -> cases.Work:
+        inputs = {"ct1": {"scan": ct}, "patient": {}}
+        return cases.Work(people(), Workers(1, show_progress=False), journal, inputs)
+
+    work("ab").do("registrations", {step: (list, "rows")})
+    known = work("ab").finished(step)
+    assert known is not None
+    assert known.value == list("rows")
+    assert work("cd").finished(step) is None
+    assert work("ab").finished(step._replace(method="cpd")) is None
+    other = replace(METHODS_BY_NAME["icp"], max_iterations=3)  # type: ignore[type-var]
+    monkeypatch.setattr(cases, "METHODS", {**METHODS_BY_NAME, "icp": other})
+    assert work("ab").finished(step) is None
+
+
+def test_a_worker_that_dies_is_told_and_nothing_hangs() -> None:
+    with pytest.raises(StudyError, match=r"one that ended by itself .*: start again to go on"):
+        Workers(2, show_progress=False).run("deaths", {n: (os._exit, 3) for n in range(2)})
+
+
+def test_a_run_is_opened_made_or_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    monkeypatch.setattr(runs, "METHODS", {"coarse": METHODS_BY_NAME["coarse"]})
+    monkeypatch.setattr(runs, "find_profile", lambda _: SMALL)
+    monkeypatch.setattr(runs, "run_folder", lambda *_: tmp_path / "run")
+    monkeypatch.setattr(runs, "Workers", lambda _, show: Workers(1, show))
+    assert open_run("phantom", "quick").origin == "run now: there is no run yet"
+    run = open_run("phantom", "quick")
+    assert run.origin.startswith("loaded")
+    whole = (run.folder / "metrics.csv").read_bytes()
+    (run.folder / "metrics.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:40]))
+    assert open_run("phantom", "quick").origin == "run now: the run has since been altered: edited metrics.csv"
+    assert (run.folder / "metrics.csv").read_bytes() == whole
+    assert "the seed" in str(why_stale(run, people(SMALL, 1)))
+    assert "the data set" in str(run.why_stale("planted", run_parameters(people()), 0))
 
 
 def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
