@@ -59,7 +59,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "asymmetry": Limit("a largest log ratio between the reaches of both sides", "", 0.0, 0.4, _SIDES),
         "bulge": Limit("an arch of the cartilages to the front", "mm", -0.2, 5.2, CROP),
         "fill": Limit("a density of points between the attachments over that on them", "", 0.0, 0.36, CROP),
-        "above": Limit("a sternum that ends above the 2nd attachments by", "mm", -5.0, 20.0, CROP),
+        "above": Limit("a sternum that ends above the 2nd attachments by", "mm", -5.0, 22.0, CROP),
     }
 )
 PAIR_LIMITS: Mapping[str, Limit] = MappingProxyType(
