@@ -64,8 +64,6 @@ class Claim:
             self.folder.rename(old)
         new.rename(self.folder)
         _sync(self.folder.parent)
-        self.journal.unlink(missing_ok=True)
-        shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager
