@@ -37,7 +37,7 @@ about = pd.DataFrame({name: run.overview() for name, run in runs.items()}).drop(
     ["from", "finished", "seconds", "methods"]
 )
 data = {name: datasets.find_dataset(name, params.find_profile(profile), seed) for name in runs}
-stale = {name: run.why_stale(batch.run_parameters(data[name]), seed) for name, run in runs.items()}
+stale = {name: batch.why_stale(run, data[name]) for name, run in runs.items()}
 about.loc["state"] = [stale[name] or "as now" for name in runs]
 about.T
 

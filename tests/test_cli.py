@@ -219,6 +219,9 @@ def test_two_clouds_are_registered_and_written(clouds: Path, tmp_path: Path, cap
 
 
 def test_the_default_method_keeps_the_rows(clouds: Path, tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "out").mkdir()
+    for name in ("waypoints_us.csv", "notes.txt"):  # the waypoints of an earlier registration, and the user's own
+        (tmp_path / "out" / name).write_text("old")
     assert main(["register", str(clouds / "ct.ply"), str(clouds / "us.ply"), "--out", "out"]) == 0
     capsys.readouterr()
     ct, warped = read_ply(clouds / "ct.ply"), read_ply(tmp_path / "out" / "warped.ply")
@@ -227,6 +230,7 @@ def test_the_default_method_keeps_the_rows(clouds: Path, tmp_path: Path, capsys:
     before, after = (np.linalg.norm(np.diff(points[some], axis=1)[:, 0], axis=1) for points in (ct, warped))
     assert np.corrcoef(before, after)[0, 1] > 0.9  # neighbours stay neighbours only if the order is kept
     assert not (tmp_path / "out" / "waypoints_us.csv").exists()
+    assert (tmp_path / "out" / "notes.txt").read_text() == "old"
     assert (
         json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))["method"] == "skeleton_graph"
     )
@@ -306,7 +310,14 @@ def test_a_manifest_of_ones_own_runs_compares_and_reports(tmp_path: Path, capsys
     assert inputs["ct1_ct"] == sha256_of(tmp_path / "mine" / "scans" / "ct1_ct.nii.gz")
 
     assert main(["report", "runs"]) == 0
-    assert "## mine" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "## mine" in out
+    assert err == ""
+    (tmp_path / "runs" / "mine" / "hd_table.md").write_text("| better |")
+    assert main(["report", "runs"]) == 0
+    assert capsys.readouterr().err == (
+        "study: warning: runs/mine: the run has since been altered: edited hd_table.md\n"
+    )
     assert main(["compare", "runs/mine", "runs/mine"]) == 0
     assert f"compared {len(metrics)} rows" in capsys.readouterr().out
 
@@ -337,9 +348,17 @@ def test_compare_agrees_differs_and_cannot(tmp_path: Path, capsys: Capture) -> N
     assert "1 value(s) beyond tolerance" in out
     assert "20.0" in out
     assert err == ""
+    assert main(["compare", str(reference), str(metrics_file(tmp_path / "shifted", hd=10.19))]) == 1
+    assert "1 mean(s) beyond tolerance" in capsys.readouterr().out
     assert main(["compare", str(reference), str(metrics_file(tmp_path / "other", method="cpd"))]) == 1
     assert "only in the reference" in capsys.readouterr().out
     (tmp_path / "empty").mkdir()
+    for words in (["--tolerance", "9"], [reference], [reference, reference, reference]):
+        refused(capsys, "compare", *words)  # never 1, which says that two runs differ
+    metrics_file(tmp_path / "open")
+    text = (tmp_path / "open" / "metrics.csv").read_text(encoding="utf-8")
+    (tmp_path / "open" / "metrics.csv").write_text(text.replace("\nd,", "\nopen,"), encoding="utf-8")
+    assert "expected a run of d at seed 0" in refused(capsys, "compare", reference, "open")
     assert "metrics.csv" in refused(capsys, "compare", reference, "empty")
     assert "metrics.csv" in refused(capsys, "compare", "empty", reference)
     for name, text in (("blank", ""), ("header", "a,b\n"), ("binary", "\0\1\2")):

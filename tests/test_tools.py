@@ -145,3 +145,43 @@ def test_unknown_parameters_are_refused_before_anything_runs(notebooks: ModuleTy
     with pytest.raises(SystemExit, match=r"00_sum\.py: expected parameters among a, got b"):
         notebooks.execute(tmp_path / "00_sum.py", tmp_path / "out.ipynb", {"b": 2})
     assert not (tmp_path / "out.ipynb").exists()
+
+
+def test_a_failed_notebook_is_named_kept_as_far_as_it_came_and_takes_no_other_down(
+    notebooks: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = SOURCE.replace("a = 1", 'profile = "full"').replace("print(a + 1)", "print(40)")
+    (tmp_path / "10_fails.py").write_text(f"{start}\n# %%\n\n1 / 0\n\n# %%\nprint(41)\n")
+    (tmp_path / "60_reads.py").write_text(start)
+    out = tmp_path / "out"
+    assert notebooks.main(["run", "--out", str(out), "--profile", "quick"]) == 1
+    shown, said = capsys.readouterr()
+    assert "notebook 3 of 3: 60_reads" in shown
+    assert said.splitlines() == [
+        "notebooks: 00_sum: SystemExit: 00_sum.py: expected parameters among a, got profile",
+        "notebooks: 10_fails: cell In [4] ('1 / 0'): ZeroDivisionError: division by zero; "
+        f"kept as far as it came: {out / '10_fails.ipynb'}",
+    ]
+    printed = {
+        path.stem: [o.text for c in nbformat.read(path, 4).cells for o in c.get("outputs", []) if "text" in o]
+        for path in out.glob("*.ipynb")
+    }
+    assert printed == {"10_fails": ["40\n"], "60_reads": ["40\n"]}
+
+
+def test_a_failure_in_place_does_not_cost_the_notebook_that_stands(notebooks: ModuleType, tmp_path: Path) -> None:
+    pair = tmp_path / "00_sum.ipynb"
+    before = pair.read_bytes()
+    (tmp_path / "00_sum.py").write_text(SOURCE.replace("a = 1", 'profile = "full"').replace("a + 1", "1 / 0"))
+    assert notebooks.main(["write"]) == 1
+    assert pair.read_bytes() == before
+    assert "ZeroDivisionError" in (tmp_path / "00_sum.failed.ipynb").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["61", "sum", ""])
+def test_a_selection_that_matches_no_notebook_is_an_error(
+    notebooks: ModuleType, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        notebooks.main(["write", "00", name])
+    assert f"expected a notebook among 00_sum, or the start of one, got {name!r}" in capsys.readouterr().err

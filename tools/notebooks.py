@@ -1,7 +1,9 @@
 """Run, renew and check the paired notebooks: ``run --out DIR``, ``write``, ``check``.
 
 ``run`` executes every notebook through papermill into a folder; ``write`` executes them in place, outputs kept;
-``check`` fails when a pair differs in its code, has no outputs or has outgrown 1 MB.
+``check`` fails when a pair differs in its code, has no outputs or has outgrown 1 MB. A notebook that fails is named
+with its cell and error and kept as far as it came, by ``write`` as ``.failed.ipynb`` beside the one that stands; the
+others go on, and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +46,12 @@ def code(path: Path) -> list[str]:
     return [c.source.strip() for c in cells if c.cell_type == "code" and injected not in c.metadata.get("tags", [])]
 
 
-def execute(source: Path, target: Path, parameters: dict[str, Any]) -> None:
-    """Execute one percent notebook with parameters; a failed cell raises with its traceback."""
+def execute(source: Path, target: Path, parameters: dict[str, Any], failed: Path | None = None) -> None:
+    """Execute one percent notebook with parameters; a failed cell raises with its traceback.
+
+    What was executed is written in either case: to ``target``, or where a cell failed to ``failed`` (``target`` when
+    None).
+    """
     logging.getLogger("papermill").setLevel(logging.ERROR)  # Open3D's widgets warn that no page listens
     notebook = jupytext.read(source)
     notebook.metadata["kernelspec"] = {"name": KERNEL, "display_name": "Python 3", "language": "python"}
@@ -59,15 +66,27 @@ def execute(source: Path, target: Path, parameters: dict[str, Any]) -> None:
         if unknown:
             raise SystemExit(f"{source.name}: expected parameters among {', '.join(known)}, got {', '.join(unknown)}")
         done = Path(scratch) / "done.ipynb"
-        papermill.execute_notebook(
-            str(plain), str(done), parameters, kernel_name=KERNEL, cwd=str(NOTEBOOKS), progress_bar=False
-        )
-        target.parent.mkdir(parents=True, exist_ok=True)
-        finished = nbformat.read(done, as_version=4)
-        tidy(finished)
-        temporary = target.with_name(f".{target.name}")
-        nbformat.write(finished, temporary)
-        temporary.replace(target)
+        try:
+            papermill.execute_notebook(
+                str(plain), str(done), parameters, kernel_name=KERNEL, cwd=str(NOTEBOOKS), progress_bar=False
+            )
+        except Exception:
+            if done.is_file():  # papermill writes after each cell
+                keep(done, failed or target)
+            raise
+        keep(done, target)
+        if failed is not None:
+            failed.unlink(missing_ok=True)
+
+
+def keep(done: Path, target: Path) -> None:
+    """Put an executed notebook in its place, tidied."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    finished = nbformat.read(done, as_version=4)
+    tidy(finished)
+    temporary = target.with_name(f".{target.name}")
+    nbformat.write(finished, temporary)
+    temporary.replace(target)
 
 
 def tidy(notebook: Any) -> None:
@@ -81,8 +100,8 @@ def tidy(notebook: Any) -> None:
             cell.outputs = [o for o in cell.outputs if o.get("name") != "stderr"]
 
 
-def main() -> int:
-    """Do what the command line asks."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do what the command line asks; 1 when a notebook failed or a pair is at fault, 2 when the words are wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     run = verbs.add_parser("run", help="execute into a folder")
@@ -93,9 +112,13 @@ def main() -> int:
         verb.add_argument("--jobs", type=int, default=1, help="notebooks at a time")
         verb.add_argument("--profile", choices=("quick", "full"), default="full")
     verbs.add_parser("check", help="pairs agree, outputs are there, sizes are small")
-    chosen = parser.parse_args()
+    chosen = parser.parse_args(arguments)
     if chosen.verb == "check":
         return check()
+    stems = [source.stem for source in sources()]
+    for name in chosen.names:
+        if not name or not any(stem.startswith(name) for stem in stems):
+            parser.error(f"expected a notebook among {', '.join(stems)}, or the start of one, got {name!r}")
     os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # else its banner is the first output
     todo = [s for s in sources() if not chosen.names or any(s.stem.startswith(name) for name in chosen.names)]
@@ -108,20 +131,40 @@ def main() -> int:
             for dataset in reported()[1:]  # the first is the notebook's own
         ]
     folder = chosen.out if chosen.verb == "run" else NOTEBOOKS
-    done = 0
+    suffix = ".ipynb" if chosen.verb == "run" else ".failed.ipynb"  # in place, a failure does not cost the good one
+    calls = {
+        stem: delayed(_one)(source, folder / f"{stem}.ipynb", parameters, folder / f"{stem}{suffix}")
+        for source, stem, parameters in jobs
+    }
+    return execute_all(calls, chosen.jobs)
+
+
+def execute_all(calls: Mapping[str, Any], n_jobs: int) -> int:
+    """Make every call of `_one`, by stem; 1 if a notebook failed."""
+    done, faults = 0, []
     for lowest, next_lowest in (("0", "5"), ("5", "6"), ("6", ":")):  # 50 may run the study that 60 reads
-        group = [job for job in jobs if lowest <= job[1] < next_lowest]
-        calls = [delayed(_one)(source, folder / f"{stem}.ipynb", parameters) for source, stem, parameters in group]
-        for stem, seconds in Parallel(n_jobs=chosen.jobs, return_as="generator_unordered")(calls):
+        group = [call for stem, call in calls.items() if lowest <= stem < next_lowest]
+        for stem, seconds, fault in Parallel(n_jobs=n_jobs, return_as="generator_unordered")(group):
             done += 1
-            print(f"notebook {done} of {len(jobs)}: {stem}, {seconds:.0f} s", flush=True)
-    return 0
+            faults += [f"{stem}: {fault}"] if fault else []
+            print(f"notebook {done} of {len(calls)}: {stem}, {seconds:.0f} s{', failed' if fault else ''}", flush=True)
+    for fault in faults:
+        print(f"notebooks: {fault}", file=sys.stderr)
+    return 1 if faults else 0
 
 
-def _one(source: Path, target: Path, parameters: dict[str, Any]) -> tuple[str, float]:
-    start = time.perf_counter()
-    execute(source, target, parameters)
-    return target.stem, time.perf_counter() - start
+def _one(source: Path, target: Path, parameters: dict[str, Any], failed: Path) -> tuple[str, float, str]:
+    """Execute one notebook: its stem, the seconds it took, and what failed, where; empty if nothing did."""
+    start, fault = time.perf_counter(), ""
+    try:
+        execute(source, target, parameters, failed if failed != target else None)
+    except papermill.PapermillExecutionError as error:
+        line = next((line for line in error.source.splitlines() if line.strip()), "")
+        told = " ".join(f"{error.ename}: {error.evalue}".split())
+        fault = f"cell In [{error.exec_count}] ({line!r}): {told}; kept as far as it came: {failed}"
+    except (Exception, SystemExit) as error:  # a kernel that died, a file that cannot be written
+        fault = " ".join(f"{type(error).__name__}: {error}".split())
+    return target.stem, time.perf_counter() - start, fault
 
 
 def check() -> int:

@@ -117,7 +117,10 @@ def list_datasets(reported: bool) -> None:
     "else a folder of its own below results/trials]",
 )
 def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, out: Path | None) -> None:
-    """Run every pair of a dataset with every method."""
+    """Run every pair of a dataset with every method.
+
+    A run that was stopped goes on when the same command is given again: finished cases are kept beside its folder.
+    """
     from study.batch import run_study
     from study.datasets import find_dataset
     from study.params import find_profile
@@ -131,7 +134,9 @@ def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, o
 
 
 def _report(run: Run) -> None:
-    """Print what a run wrote: tables, waypoint errors, and the cases that failed with their reasons."""
+    """Print what a run wrote: tables, waypoint errors, the cases that failed, and whether the folder is as it was."""
+    from study.results.run import FAILURES_LOG
+
     for table in run.tables():
         click.echo(f"\n{table.read_text(encoding='utf-8')}")
     if not run.values.empty:
@@ -139,6 +144,10 @@ def _report(run: Run) -> None:
         click.echo(run.waypoint_summary().round(2).to_string(index=False, na_rep="-"))
     for (source, target, reason), cases in run.failures.groupby(["source", "target", "reason"], sort=False):
         click.echo(f"{source} to {target}, {', '.join(cases['method'])}: failed: {reason}")
+    if (run.folder / FAILURES_LOG).is_file():
+        click.echo(f"where in the code: {run.folder / FAILURES_LOG}")
+    if run.condition:
+        click.echo(f"study: warning: {run.folder}: the run {run.condition}", err=True)
     click.echo(f"metrics, tables and provenance: {run.folder}")
 
 
@@ -146,13 +155,13 @@ def _report(run: Run) -> None:
 @click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
 def report(folder: Path) -> None:
     """Print the tables of every run under FOLDER."""
-    from study.results.run import find_runs
+    from study.results.run import find_runs, visible
 
     for run in find_runs(folder):
         click.echo(f"\n## {run.folder.relative_to(folder)}")
         _report(run)
     for label, pattern in (("figures", "*.png"), ("notebooks", "*.ipynb")):
-        for place in sorted({path.parent for path in folder.rglob(pattern)}):
+        for place in sorted({path.parent for path in visible(folder, pattern)}):
             click.echo(f"{label}: {place}")
 
 
@@ -186,6 +195,8 @@ def anatomy(dataset: str, out: Path) -> None:
 @click.argument("candidate", type=click.Path(path_type=Path))
 def compare(reference: Path, candidate: Path) -> None:
     """Check a run against a reference.
+
+    Every value and every method's mean must be within its metric's tolerance, and the methods in the same order.
 
     Exit code 0: agrees; 1: differs, the largest differences are listed; 2: can't be compared.
     """
@@ -283,7 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except BrokenPipeError:  # whoever read the output has gone: `study data list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return 141  # as a shell says of SIGPIPE; 1 is what `study compare` says of runs that differ
     except OSError as error:
         click.echo(f"study: expected a file or folder that can be read and written, got {error}", err=True)
         return 2

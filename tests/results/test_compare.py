@@ -4,11 +4,22 @@ from result_rows import some_rows
 from study.errors import StudyError
 from study.evaluation.metrics import METRICS
 from study.results.compare import compare
+from study.results.metrics_csv import Case, metric_rows, read_metrics
+from study.results.run import REFERENCE
+
+
+def tolerance(row):
+    """Of waypoints, whose many values average out; of a metric with one value a pair, that of the mean."""
+    metric = METRICS.get(row["metric"], METRICS["hd"])
+    return metric.tolerance if row["metric"].startswith("waypoint") else metric.mean_tolerance
 
 
 def test_a_run_agrees_with_itself_and_with_small_differences(run):
     rows = some_rows(without=[("ct2", "icp")])
-    small = [{**row, "value": row["value"] + 0.9 * METRICS.get(row["metric"], METRICS["hd"]).tolerance} for row in rows]
+    small = [
+        {**row, "value": row["value"] + (-0.9 if row["index"] % 2 else 0.9) * tolerance(row)}  # to either side
+        for row in rows
+    ]
     for name, other in (("same", rows), ("small", small)):
         comparison = compare(run("reference", rows), run(name, other))
         assert comparison.n_compared == len(rows)
@@ -74,3 +85,62 @@ def test_folders_of_datasets_are_compared_together(run, tmp_path):
     (tmp_path / "candidate" / "open" / "metrics.csv").unlink()
     with pytest.raises(StudyError, match=r"open/metrics\.csv only in"):
         compare(tmp_path / "reference", tmp_path / "candidate")
+
+
+def shifted(rows, method, mm, metric=None):
+    chosen = {metric} if metric else set(METRICS)
+    return [
+        {**row, "value": row["value"] + mm} if row["method"] == method and row["metric"] in chosen else row
+        for row in rows
+    ]
+
+
+@pytest.mark.parametrize("metric", ["hd", "waypoint_error", "waypoint_error_inplane"])
+def test_a_shift_of_every_row_of_a_method_differs_though_each_row_is_within_tolerance(run, metric):
+    rows = some_rows()
+    mm = 0.95 * METRICS[metric].tolerance
+    comparison = compare(run("a", rows), run("b", shifted(rows, "skeleton_graph", mm, metric)))
+    assert comparison.differences.empty
+    assert comparison.exit_code == 1
+    found = comparison.shifts[["method", "metric"]].to_numpy().tolist()
+    assert found == [["skeleton_graph", metric]]
+    assert comparison.shifts["shift"].item() == pytest.approx(mm)
+    assert "1 mean(s) beyond tolerance" in comparison.report()
+
+
+def test_an_order_that_turns_differs_however_little_moved(run):
+    rows = [
+        row
+        for k, method in enumerate(("skeleton_graph", "icp", "cpd"))
+        for source in ("ct1", "ct2")
+        for row in metric_rows(Case("phantom", source, "p", method, 0), {"hd": 8.0 + 0.004 * k, "msd": 1.0})
+    ]
+    reference = run("a", rows)
+    comparison = compare(reference, run("b", shifted(rows, "skeleton_graph", 0.006, "hd")))
+    assert comparison.differences.empty
+    assert comparison.shifts.empty
+    assert comparison.exit_code == 1
+    report = comparison.report()
+    assert "phantom, hd: by mean skeleton_graph < icp < cpd; now icp < skeleton_graph < cpd" in report
+    assert "phantom, smallest Hausdorff distance on every CT: 2 of 2; now 0 of 2" in report
+    assert compare(reference, run("c", shifted(rows, "skeleton_graph", 0.003, "hd"))).agrees
+
+
+def test_the_reference_with_one_method_moved_differs(run):
+    """0.19 mm on every row of one method, each within its tolerance of 0.2 mm, makes the best method the second."""
+    reference = REFERENCE / "phantom"
+    rows = read_metrics(reference / "metrics.csv")
+    rows.loc[(rows["method"] == "skeleton_graph") & (rows["metric"] == "hd"), "value"] += 0.19
+    comparison = compare(reference, run("moved", rows.to_dict("records")))
+    assert comparison.differences.empty
+    assert comparison.exit_code == 1
+    assert any("now nonrigid_icp < skeleton_graph" in told for told in comparison.upsets)
+    assert compare(reference, reference).agrees
+
+
+def test_runs_of_other_data_or_seeds_cannot_be_compared(run):
+    good = run("good", some_rows())
+    with pytest.raises(StudyError, match=r"expected a run of phantom at seed 0, as .* got open at seed 0"):
+        compare(good, run("other", some_rows(dataset="open")))
+    with pytest.raises(StudyError, match="got phantom at seed 3"):
+        compare(good, run("seed", [{**row, "seed": 3} for row in some_rows()]))

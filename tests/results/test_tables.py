@@ -103,10 +103,14 @@ def rows_of(cases: list[tuple[str, str]]) -> pd.DataFrame:
 
 
 def test_one_patient_gives_one_table_and_more_give_one_each_and_all_pairs(tmp_path: Path) -> None:
-    write_tables(rows_of([("a", "b"), ("b", "a"), ("c", "a")]), tmp_path)
-    assert {path.stem for path in tmp_path.glob("*.md")} == {"hd_table_a", "hd_table_b", "hd_all_pairs"}
-    write_tables(rows_of([("a", "p"), ("b", "p")]), tmp_path)  # the former run's are gone
-    assert {path.stem for path in tmp_path.glob("*.md")} == {"hd_table"}
+    for name in ("one", "more"):
+        (tmp_path / name).mkdir()
+    write_tables(rows_of([("a", "b"), ("b", "a"), ("c", "a")]), tmp_path / "more")
+    assert {path.stem for path in (tmp_path / "more").glob("*.md")} == {"hd_table_a", "hd_table_b", "hd_all_pairs"}
+    (tmp_path / "one" / "hd_mine.csv").write_text("mine")
+    write_tables(rows_of([("a", "p"), ("b", "p")]), tmp_path / "one")
+    assert {path.stem for path in (tmp_path / "one").glob("*.md")} == {"hd_table"}
+    assert (tmp_path / "one" / "hd_mine.csv").read_text() == "mine"
 
 
 def test_one_ct_with_several_patients_has_them_as_columns(tmp_path: Path) -> None:

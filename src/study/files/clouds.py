@@ -124,6 +124,8 @@ def write_registration(
             table["label"] = waypoints.labels
         if told:
             table["reason"] = path.reasons
+    for name in ("registration.json", "waypoints_us.csv"):  # of an earlier registration, which this one is not
+        (folder / name).unlink(missing_ok=True)
     write_ply(PointCloud(result.warped, "warped"), folder / "warped.ply")
     summary = {
         "method": result.method,

@@ -1,13 +1,15 @@
-"""A run against a reference: the same rows, every value within its metric's tolerance."""
+"""A run against a reference: the same rows, values and means within tolerance, the methods in the same order."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
 from study.errors import StudyError
+from study.evaluation.claims import CLAIMS
 from study.evaluation.metrics import METRICS
 from study.results.metrics_csv import CASE, KEY, OK, read_metrics
 
@@ -23,6 +25,9 @@ class Comparison:
         extra: keys of rows that only the candidate has.
         differences: rows in both that differ by more than their tolerance or in status, largest multiple first;
             columns as `KEY`, then ``reference``, ``candidate``, ``difference``, ``tolerance``, ``times_tolerance``.
+        shifts: methods whose mean of a metric differs by more than the tolerance for means, over the rows in both;
+            columns dataset, method, metric, reference, candidate, shift, tolerance, times_tolerance.
+        upsets: a sentence for each order of methods and each claim's outcome that the candidate turns.
         largest: the largest difference of all compared rows as a multiple of its tolerance.
     """
 
@@ -31,12 +36,15 @@ class Comparison:
     missing: pd.DataFrame
     extra: pd.DataFrame
     differences: pd.DataFrame
+    shifts: pd.DataFrame
+    upsets: tuple[str, ...]
     largest: float
 
     @property
     def agrees(self) -> bool:
-        """Same rows, and every value within its tolerance."""
-        return not (len(self.missing) or len(self.extra) or len(self.differences))
+        """Same rows, every value and mean within its tolerance, the methods in the same order."""
+        found = (self.missing, self.extra, self.differences, self.shifts, self.upsets)
+        return not any(len(rows) for rows in found)
 
     @property
     def exit_code(self) -> int:
@@ -51,6 +59,10 @@ class Comparison:
                 lines += [f"{len(rows)} row(s) {title}:", *_listed(rows, n_largest)]
         if len(self.differences):
             lines += [f"{len(self.differences)} value(s) beyond tolerance:", *_listed(self.differences, n_largest)]
+        if len(self.shifts):
+            lines += [f"{len(self.shifts)} mean(s) beyond tolerance:", *_listed(self.shifts, n_largest)]
+        if self.upsets:
+            lines += [f"{len(self.upsets)} order(s) or claim(s) turned:", *(f"  {told}" for told in self.upsets)]
         used = f"largest difference {self.largest:.3g} of its tolerance"
         return "\n".join([*lines, f"agrees; {used}" if self.agrees else "differs"])
 
@@ -61,7 +73,7 @@ def _listed(rows: pd.DataFrame, n: int) -> list[str]:
 
 
 def compare(reference: Path, candidate: Path) -> Comparison:
-    """Compare a run with a reference: the same rows, then each value within its metric's tolerance.
+    """Compare a run with a reference: the same rows; each value and each method's mean within tolerance; their order.
 
     Args:
         reference: a folder with ``metrics.csv``, or with one such folder per dataset.
@@ -69,7 +81,7 @@ def compare(reference: Path, candidate: Path) -> Comparison:
 
     Raises:
         StudyError: what cannot be compared: a file that is missing, empty, unreadable or of another schema, in the
-            reference or the candidate.
+            reference or the candidate; runs of other data sets or seeds.
     """
     names = _metrics_files(reference)
     if not names:
@@ -83,11 +95,19 @@ def compare(reference: Path, candidate: Path) -> Comparison:
         )
     tables = [(read_metrics(reference / name), read_metrics(candidate / name)) for name in names]
     theirs, ours = (pd.concat(column, ignore_index=True) for column in zip(*tables, strict=True))
+    expected, got = _about(theirs), _about(ours)
+    if expected != got:
+        raise StudyError(f"expected a run of {expected}, as {reference} is, got {got} in {candidate}")
     return _compare(theirs, ours, len(names))
 
 
 def _names(paths: list[Path]) -> str:
     return ", ".join(path.as_posix() for path in paths) or "nothing"
+
+
+def _about(metrics: pd.DataFrame) -> str:
+    runs = metrics[["dataset", "seed"]].drop_duplicates().sort_values(["dataset", "seed"])
+    return ", ".join(f"{name} at seed {seed}" for name, seed in runs.itertuples(index=False))
 
 
 def _metrics_files(folder: Path) -> list[Path]:
@@ -110,11 +130,44 @@ def _compare(reference: pd.DataFrame, candidate: pd.DataFrame, n_files: int) -> 
     for side, name in (("r", "reference"), ("c", "candidate")):
         pairs = zip(differences[f"value_{side}"], differences[f"status_{side}"], strict=True)
         differences[name] = [f"{value!r}" + ("" if status == OK else f" ({status})") for value, status in pairs]
+    shifts = _shifts(shared)
     return Comparison(
         n_files=n_files,
         n_compared=int((both["where"] == "both").sum()),
         missing=both.loc[both["where"] == "left_only", keys],
         extra=both.loc[both["where"] == "right_only", keys],
         differences=differences[[*keys, "reference", "candidate", "difference", "tolerance", "times_tolerance"]],
+        shifts=shifts,
+        upsets=tuple(_upsets(*(shared.rename(columns={f"value_{side}": "value"}) for side in ("r", "c")))),
         largest=float(shared["times_tolerance"].max()) if len(shared) else 0.0,
     )
+
+
+def _shifts(shared: pd.DataFrame) -> pd.DataFrame:
+    """Means of a method and metric that moved by more than the tolerance for means, the largest multiple first."""
+    means = shared.groupby(["dataset", "method", "metric"])[["value_r", "value_c"]].mean().reset_index()
+    means = means.rename(columns={"value_r": "reference", "value_c": "candidate"})
+    means["shift"] = means["candidate"] - means["reference"]
+    means["tolerance"] = means["metric"].map({name: metric.mean_tolerance for name, metric in METRICS.items()})
+    means["times_tolerance"] = means["shift"].abs() / means["tolerance"]
+    return means[means["times_tolerance"] > 1].sort_values("times_tolerance", ascending=False, kind="stable")
+
+
+def _upsets(reference: pd.DataFrame, candidate: pd.DataFrame) -> Iterator[str]:
+    """What a reader is told of the order of the methods, where the candidate tells it otherwise."""
+    for name in reference["dataset"].unique():
+        theirs, ours = (table[table["dataset"] == name] for table in (reference, candidate))
+        for metric in dict.fromkeys(claim.metric for claim in CLAIMS):
+            before, after = (_order(table[table["metric"] == metric]) for table in (theirs, ours))
+            if before != after:
+                yield f"{name}, {metric}: by mean {' < '.join(before)}; now {' < '.join(after)}"
+        for claim in CLAIMS:
+            was, is_now = claim.outcome(theirs), claim.outcome(ours)
+            if was != is_now:
+                yield f"{name}, {claim.text}: {was}; now {is_now}"
+
+
+def _order(rows: pd.DataFrame) -> list[str]:
+    """Methods by their mean over the pairs, the smallest first."""
+    pairs = rows.groupby(["method", "source", "target"])["value"].mean()
+    return list(pairs.groupby("method").mean().sort_values(kind="stable").index)

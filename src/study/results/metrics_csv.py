@@ -81,8 +81,9 @@ def metric_rows(case: Case, values: Mapping[str, ArrayLike], *, converged: bool 
 
 
 def failed_row(case: Case, reason: str) -> Row:
-    """The one row of a case that failed."""
-    rest = {"metric": CASE, "index": 0, "value": float("nan"), "unit": "", "status": FAILED + " ".join(reason.split())}
+    """The one row of a case that failed; of the reason, whatever cannot stand in a line of text is left out."""
+    told = " ".join("".join(c if c.isprintable() else " " for c in reason).split())
+    rest = {"metric": CASE, "index": 0, "value": float("nan"), "unit": "", "status": FAILED + told}
     return {**case.key, **rest}
 
 

@@ -21,6 +21,7 @@ DISTRIBUTION = "thoracic-cartilage-study"  # the package index's name of `study`
 
 
 def provenance(
+    dataset: str,
     parameters: Mapping[str, Any],
     seed: int,
     inputs: Mapping[str, str],
@@ -31,6 +32,7 @@ def provenance(
     """Where a run's numbers come from.
 
     Args:
+        dataset: its name.
         parameters: every parameter of the run; dataclasses are taken apart.
         seed: the run's seed.
         inputs: SHA-256 of each input file by name.
@@ -46,19 +48,20 @@ def provenance(
         "code_sha256": code_sha256(root),
         "lock_sha256": sha256_of(lock) if lock.is_file() else None,
         "inputs_sha256": dict(inputs),
+        "dataset": dataset,
         "parameters": dict(parameters),
         "seed": seed,
         "versions": _versions(),
-        "machine": {
-            "platform": platform.platform(),
-            "architecture": platform.machine(),
-            "processor": _processor(),
-            "cores": os.cpu_count(),
-        },
+        "machine": {"platform": platform.platform(), "cores": os.cpu_count(), **_processor()},
         "started": started.isoformat(timespec="seconds"),
         "finished": finished.isoformat(timespec="seconds"),
         "seconds": (finished - started).total_seconds(),
     }
+
+
+def arithmetic() -> dict[str, Any]:
+    """What decides the last bits of a number beside inputs and parameters: code, versions, processor."""
+    return {"code_sha256": code_sha256(), "versions": _versions(), **_processor()}
 
 
 def _root() -> Path:
@@ -113,9 +116,9 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _processor() -> str:
+def _processor() -> dict[str, str]:
     try:
         names = re.findall(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
     except OSError:
         names = []
-    return names[0] if names else platform.processor()
+    return {"architecture": platform.machine(), "processor": names[0] if names else platform.processor()}

@@ -6,7 +6,6 @@ import json
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -17,8 +16,9 @@ import pandas as pd
 from study.errors import StudyError
 from study.evaluation.metrics import METRICS
 from study.evaluation.pair import TRUTH, in_order
-from study.files.atomic import json_text, write_bytes, write_json
+from study.files.atomic import json_text, sha256_of, write_bytes, write_json, write_text
 from study.files.places import CHECKOUT
+from study.results.claim import PROVENANCE, Claim, claimed
 from study.results.compare import Comparison, compare
 from study.results.metrics_csv import (
     CASE,
@@ -29,11 +29,12 @@ from study.results.metrics_csv import (
     write_metrics,
     write_timings,
 )
-from study.results.provenance import code_sha256, provenance
+from study.results.provenance import code_sha256
 from study.results.tables import hd_table, mean_sd_table, waypoint_summary, write_tables
 
 REFERENCE = CHECKOUT / "results" / "reference"
 PAIR = ["source", "target"]
+FAILURES_LOG = "failures.log"  # of a run with cases that failed in a way nobody foresaw: where in the code
 
 
 def run_folder(
@@ -176,22 +177,69 @@ class Run:
         }
         return pd.Series(lines, name=self.dataset)
 
-    def why_stale(self, parameters: Mapping[str, Any], seed: int, root: Path | None = None) -> str | None:
+    @property
+    def altered(self) -> str | None:
+        """What of the folder is not as the run left it, as the end of a sentence about it; None when all is.
+
+        Raises:
+            StudyError: no provenance that can be read.
+        """
+        files = self.provenance.get("files_sha256")
+        if not isinstance(files, dict):
+            return "was made by an older version, whose provenance does not hold the hashes of its files"
+        paths = {self.folder / name: sha256 for name, sha256 in files.items()}
+        missing = [path.name for path in paths if not path.is_file()]
+        changed = [path.name for path, sha256 in paths.items() if path.is_file() and sha256_of(path) != sha256]
+        told = [f"{what} {', '.join(names)}" for what, names in (("lost", missing), ("edited", changed)) if names]
+        return f"has since been altered: {'; '.join(told)}" if told else None
+
+    @property
+    def condition(self) -> str | None:
+        """`altered`, or why that can't be told, as the end of a sentence about the run; None when all is well."""
+        try:
+            return self.altered
+        except StudyError as error:
+            return f"cannot be told from an altered one: {error}"
+
+    def why_stale(
+        self,
+        dataset: str,
+        parameters: Mapping[str, Any],
+        seed: int,
+        inputs: Mapping[str, str] | None = None,
+        root: Path | None = None,
+    ) -> str | None:
         """Why this run cannot stand for one made now; None when it can.
 
         Args:
-            parameters: as given to `write_run`.
+            dataset: its name.
+            parameters: as given to `study.results.provenance.provenance`.
             seed: of the run.
+            inputs: SHA-256 of the input files that are here, by name; the others are taken to be as they were.
             root: the checkout whose code would run; the running code's when None.
         """
         if not (self.folder / "metrics.csv").is_file():
             return "there is no run yet"
         try:
-            before = self.provenance
+            before, altered = self.provenance, self.altered
         except StudyError as error:
-            return f"its provenance.json cannot be read: {error}"
-        now = {"code_sha256": code_sha256(root), "seed": seed, "parameters": json.loads(json_text(parameters))}
-        words = {"code_sha256": "the code", "seed": "the seed", "parameters": "a parameter or the list of methods"}
+            return f"its {PROVENANCE} cannot be read: {error}"
+        if altered:
+            return f"the run {altered}"
+        now = {
+            "dataset": dataset,
+            "code_sha256": code_sha256(root),
+            "seed": seed,
+            "parameters": json.loads(json_text(parameters)),
+            "inputs_sha256": {**before.get("inputs_sha256", {}), **(inputs or {})},
+        }
+        words = {
+            "dataset": "the data set",
+            "code_sha256": "the code",
+            "seed": "the seed",
+            "parameters": "a parameter or the list of methods",
+            "inputs_sha256": "an input file",
+        }
         changed = [words[name] for name, value in now.items() if before.get(name) != value]
         return f"since it was made, {' and '.join(changed)} changed" if changed else None
 
@@ -204,8 +252,23 @@ class Run:
         return sorted(self.folder.glob("hd_table*.md"))
 
     def keep_figures(self, pictures: Mapping[str, bytes]) -> list[str]:
-        """Write PNG pictures beside the metrics; their file names."""
-        return keep_pictures(self.folder, pictures)
+        """Write PNG pictures of this run beside its metrics, and their hashes into its provenance; their file names.
+
+        Raises:
+            StudyError: the folder holds another run by now, or one that was altered.
+        """
+        with claimed(self.folder, wait=True):
+            there = Run(self.folder)
+            if there.provenance["finished"] != self.provenance["finished"]:
+                raise StudyError(f"{self.folder}: expected the run that the figures are of, got a later one; open it")
+            if there.altered:
+                raise StudyError(
+                    f"{self.folder}: expected the run as it was made, but it {there.altered}; run it again"
+                )
+            names = keep_pictures(self.folder, pictures)
+            hashes = {**there.provenance["files_sha256"], **{name: sha256_of(self.folder / name) for name in names}}
+            write_json({**there.provenance, "files_sha256": hashes}, self.folder / PROVENANCE)
+        return names
 
     def _repr_html_(self) -> str:
         """A few lines and one small picture, for a notebook."""
@@ -227,36 +290,30 @@ class Run:
 
 
 def write_run(
-    folder: Path,
-    rows: Sequence[Row],
-    timings: Sequence[Row],
-    parameters: Mapping[str, Any],
-    seed: int,
-    inputs: Mapping[str, str],
-    started: datetime,
+    claim: Claim, rows: Sequence[Row], timings: Sequence[Row], provenance: Mapping[str, Any], failures: str = ""
 ) -> Run:
-    """Write metrics, timings, provenance and tables of a run that has just ended.
+    """Write metrics, timings, tables and provenance of a run that has just ended, all at once.
 
     Args:
-        folder: where to.
+        claim: on its folder.
         rows: of ``metrics.csv``.
         timings: of ``timings.csv``.
-        parameters: everything that decides the numbers but seed and code.
-        seed: of the run.
-        inputs: SHA-256 of each input file by name.
-        started: wall-clock time with a time zone.
+        provenance: see `study.results.provenance.provenance`; the hashes of the run's files are added.
+        failures: tracebacks of cases that failed in a way nobody foresaw.
 
     Raises:
-        StudyError: rows that are not of the schema, or no case that succeeded; the rows with the reasons are written.
+        StudyError: rows that are not of the schema, or a file of somebody else's in the way; nothing is changed then.
     """
-    write_metrics(rows, folder / "metrics.csv")
-    write_timings(timings, folder / "timings.csv")
-    write_json(provenance(parameters, seed, inputs, started, datetime.now(UTC)), folder / "provenance.json")
-    run = Run(folder)
-    write_tables(run.metrics, folder)
-    if run.values.empty:
-        raise StudyError(f"{run.dataset}: every case failed: {' | '.join(sorted(set(run.failures['reason'])))}")
-    return run
+    new = claim.new()
+    write_metrics(rows, new / "metrics.csv")
+    write_timings(timings, new / "timings.csv")
+    if failures:
+        write_text(new / FAILURES_LOG, failures)
+    write_tables(read_metrics(new / "metrics.csv"), new)
+    hashes = {path.name: sha256_of(path) for path in new.iterdir()}
+    write_json({**provenance, "files_sha256": hashes}, new / PROVENANCE)
+    claim.swap_in()
+    return Run(claim.folder)
 
 
 def find_runs(folder: Path) -> list[Run]:
@@ -265,10 +322,16 @@ def find_runs(folder: Path) -> list[Run]:
     Raises:
         StudyError: none.
     """
-    found = sorted(path.parent for path in folder.rglob("metrics.csv"))
+    found = [path.parent for path in visible(folder, "metrics.csv")]
     if not found:
         raise StudyError(f"{folder}: expected runs with a metrics.csv below it, got none; run `study run` first")
     return [Run(path) for path in found]
+
+
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """Files below a folder, by path, without hidden folders: what is not finished is not shown."""
+    found = folder.rglob(pattern)
+    return sorted(path for path in found if not any(p.startswith(".") for p in path.relative_to(folder).parts))
 
 
 def newest(dataset: str, profile: str, seed: int) -> Run | None:

@@ -18,12 +18,10 @@ from study.results.metrics_csv import CASE, KEY, NOT_CONVERGED
 
 
 def write_tables(metrics: pd.DataFrame, out: Path) -> None:
-    """Hausdorff tables in the shape of the paper's Table I: one a patient, columns the CTs.
+    """Write into a new folder the Hausdorff tables in the shape of the paper's Table I: one a patient, columns the CTs.
 
     One CT with several patients (the planted deformations) is turned: columns are the patients.
     """
-    for old in out.glob("hd_*.*"):  # of a run with other people
-        old.unlink()
     targets = sorted(metrics["target"].unique())
     dataset = metrics["dataset"].iloc[0]
     if metrics["source"].nunique() == 1:

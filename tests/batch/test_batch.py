@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +13,14 @@ import pytest
 from phantom_files import SMALL, cached_ct_volume
 
 from study import METHODS as METHODS_BY_NAME
-from study import batch, phantom
-from study.batch import Outcome, Workers, run_dataset, run_study
+from study import phantom
+from study.batch import cases, open_run, run_dataset, run_parameters, run_study, runs, why_stale
+from study.batch.workers import Outcome, Workers
 from study.datasets import Anatomy, Dataset, PhantomDataset, PlantedDataset, find_dataset
 from study.errors import StudyError
 from study.evaluation.pair import TRUTH
 from study.params import StudyParams
+from study.results.journal import Journal
 from study.results.metrics_csv import FAILED, read_metrics
 
 METHODS = ("coarse", "icp")
@@ -104,6 +108,17 @@ Load = Callable[..., Anatomy]
 ANATOMY: Load = PhantomDataset.anatomy
 
 
+@cache
+def known(name: str) -> Anatomy:
+    return ANATOMY(people(), name)
+
+
+@pytest.fixture
+def known_people(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anatomies of the phantom, made once."""
+    monkeypatch.setattr(PhantomDataset, "anatomy", lambda _, name, *rest: known(name))
+
+
 def failing(who: str, error: Exception) -> Load:
     def load(self: Dataset, name: str, *rest: Any) -> Anatomy:
         if name == who:
@@ -142,24 +157,150 @@ def test_a_patient_that_fails_takes_every_case_with_it_and_that_is_an_error(
 
 
 def test_a_method_that_fails_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = batch.register_aligned
+    whole = cases.register_aligned
 
     def register(alignment: Any, method: Any, *rest: Any) -> Any:
         if method == METHODS_BY_NAME["icp"]:
             raise StudyError("icp: expected overlap, got none")
         return whole(alignment, method, *rest)
 
-    monkeypatch.setattr(batch, "register_aligned", register)
+    monkeypatch.setattr(cases, "register_aligned", register)
     rows, timings = run_dataset(people(), methods=METHODS)
     assert {row["method"] for row in rows if row["status"].startswith(FAILED)} == {"icp"}
     assert sum(row["method"] == "coarse" and row["status"] == "ok" for row in rows) > 80
     assert [row["method"] for row in timings if row["stage"] == "register"] == ["coarse", TRUTH]
 
 
-def test_a_bug_is_no_failed_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct1", ZeroDivisionError("oops")))
-    with pytest.raises(ZeroDivisionError):
-        run_dataset(people(), methods=["coarse"])
+class Odd(Exception):
+    """As some libraries have it: one that cannot be sent from one process to another."""
+
+    def __init__(self, one: int, two: int) -> None:
+        super().__init__(f"{one} and {two}")
+
+
+def test_whatever_one_case_raises_is_its_row_and_its_place_in_the_code_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    errors = {
+        "icp": ZeroDivisionError("oops"),
+        "cpd": Odd(1, 2),
+        "nonrigid_icp": SystemExit(3),
+        "cpd_tuned": MemoryError(),
+    }
+    whole = cases.register_aligned
+
+    def register(alignment: Any, method: Any, *rest: Any) -> Any:
+        for name, error in errors.items():
+            if method == METHODS_BY_NAME[name]:
+                raise error
+        return whole(alignment, method, *rest)
+
+    monkeypatch.setattr(cases, "register_aligned", register)
+    run = run_study(people(), tmp_path / "out", methods=["coarse", *errors])
+    assert dict(zip(run.failures["method"], run.failures["reason"], strict=True)) == {
+        "icp": "ZeroDivisionError: oops",
+        "cpd": "Odd: 1 and 2",
+        "nonrigid_icp": "SystemExit: 3",
+        "cpd_tuned": "MemoryError",
+    }
+    log = (tmp_path / "out" / "failures.log").read_text(encoding="utf-8")
+    assert "ct1 patient icp register" in log
+    assert log.count("in register") == len(errors)
+    assert set(run.values["method"]) == {"coarse", TRUTH}
+    assert run.altered is None
+
+
+def test_a_value_that_is_not_finite_is_a_failed_case_and_no_lost_run(
+    monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    monkeypatch.setattr(cases, "judge", lambda *_: {"hd": [float("nan")]})
+    rows, _ = run_dataset(people(), methods=["coarse"])
+    assert [row["status"] for row in rows] == [
+        f"failed: ct1/{name}: expected finite hd, got [nan]; write a failed row instead" for name in ("coarse", TRUTH)
+    ]
+
+
+def test_a_stopped_run_does_only_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    """Ctrl-C in the second of two pairs: the first is not even looked at again."""
+    whole, done = cases.register_aligned, []
+
+    def register(alignment: Any, *rest: Any) -> Any:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(alignment.source.cloud.name)
+        return whole(alignment, *rest)
+
+    monkeypatch.setattr(cases, "register_aligned", register)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(people(TWO_CTS), tmp_path / "out", methods=METHODS)
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(cases, "register_aligned", whole)
+    monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct1", AssertionError("ct1 has been done")))
+    run = run_study(people(TWO_CTS), tmp_path / "out", methods=METHODS)
+    assert done == ["ct:ct1", "ct:ct1"]
+    assert run.failures.empty
+    assert len(run.timings) == 3 + 1 + 3 + 6
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_what_another_seed_made_is_not_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    def stop(_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cases, "perfect", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run_study(people(seed=1), tmp_path / "out", methods=["coarse"])
+    assert (tmp_path / ".out.unfinished" / "finished.jsonl").is_file()
+    monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct1", StudyError("asked for again")))
+    with pytest.raises(StudyError, match="asked for again"):
+        run_study(people(seed=0), tmp_path / "out", methods=["coarse"])
+
+
+def test_a_finished_case_is_known_by_its_method_and_input_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = cases.Step("ct1", "patient", "icp", "register")
+    journal = Journal(None, {})
+
+    def work(ct: str) -> cases.Work:
+        inputs = {"ct1": {"scan": ct}, "patient": {}}
+        return cases.Work(people(), Workers(1, show_progress=False), journal, inputs)
+
+    work("ab").do("registrations", {step: (list, "rows")})
+    known = work("ab").finished(step)
+    assert known is not None
+    assert known.value == list("rows")
+    assert work("cd").finished(step) is None
+    assert work("ab").finished(step._replace(method="cpd")) is None
+    other = replace(METHODS_BY_NAME["icp"], max_iterations=3)  # type: ignore[type-var]
+    monkeypatch.setattr(cases, "METHODS", {**METHODS_BY_NAME, "icp": other})
+    assert work("ab").finished(step) is None
+
+
+def test_a_worker_that_dies_is_told_and_nothing_hangs() -> None:
+    with pytest.raises(StudyError, match=r"one that ended by itself .*: start again to go on"):
+        Workers(2, show_progress=False).run("deaths", {n: (os._exit, 3) for n in range(2)})
+
+
+def test_a_run_is_opened_made_or_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    monkeypatch.setattr(runs, "METHODS", {"coarse": METHODS_BY_NAME["coarse"]})
+    monkeypatch.setattr(runs, "find_profile", lambda _: SMALL)
+    monkeypatch.setattr(runs, "run_folder", lambda *_: tmp_path / "run")
+    monkeypatch.setattr(runs, "Workers", lambda _, show: Workers(1, show))
+    assert open_run("phantom", "quick").origin == "run now: there is no run yet"
+    run = open_run("phantom", "quick")
+    assert run.origin.startswith("loaded")
+    whole = (run.folder / "metrics.csv").read_bytes()
+    (run.folder / "metrics.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:40]))
+    assert open_run("phantom", "quick").origin == "run now: the run has since been altered: edited metrics.csv"
+    assert (run.folder / "metrics.csv").read_bytes() == whole
+    assert "the seed" in str(why_stale(run, people(SMALL, 1)))
+    assert "the data set" in str(run.why_stale("planted", run_parameters(people()), 0))
 
 
 def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,6 +309,11 @@ def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monke
         run_study(people(), tmp_path / "a", methods=["ipc"])
     with pytest.raises(StudyError, match="got none"):
         run_study(people(), tmp_path / "a", methods=[])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "hd_thesis.md").write_text("years of work")
+    with pytest.raises(StudyError, match=r"got hd_thesis\.md without its provenance\.json"):
+        run_study(people(), tmp_path / "mine", methods=["coarse"])
+    assert (tmp_path / "mine" / "hd_thesis.md").is_file()
     with pytest.raises(StudyError, match="got 'phantom2'"):
         run_study(people(name="phantom2"), tmp_path / "a", methods=["coarse"])
     (tmp_path / "file").write_text("")

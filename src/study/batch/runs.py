@@ -1,0 +1,159 @@
+"""A run of a data set: rows, or a folder of results that is made, gone on with, or found to be of now."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from study.batch.cases import Work, all_rows, input_hashes
+from study.batch.workers import Workers
+from study.datasets import Dataset, find_dataset
+from study.errors import StudyError
+from study.files.atomic import sha256_of
+from study.methods import METHODS
+from study.params import find_profile
+from study.pipeline import find_method
+from study.results.claim import Claim, claimed
+from study.results.journal import Journal
+from study.results.metrics_csv import Row
+from study.results.provenance import arithmetic, provenance
+from study.results.run import Run, run_folder, write_run
+
+
+def run_dataset(
+    dataset: Dataset, *, methods: Iterable[str] | None = None, n_jobs: int = 1, show_progress: bool = False
+) -> tuple[list[Row], list[Row]]:
+    """All cases of a data set.
+
+    Args:
+        dataset: who is registered to whom, how finely, with which seed.
+        methods: names in ``METHODS``; all when None.
+        n_jobs: worker processes.
+        show_progress: bars on standard error.
+
+    Returns:
+        rows of ``metrics.csv`` and of ``timings.csv``.
+
+    Raises:
+        StudyError: nobody to pair, or an unknown method; a person or pair that fails is rows instead.
+    """
+    return all_rows(Work(dataset, Workers(n_jobs, show_progress), Journal(None, {})), chosen_methods(methods))
+
+
+def chosen_methods(methods: Iterable[str] | None) -> list[str]:
+    """Names of the methods to run, each once and known; all when None.
+
+    Raises:
+        StudyError: none, or an unknown one.
+    """
+    chosen = list(METHODS) if methods is None else list(dict.fromkeys(methods))
+    if not chosen:
+        raise StudyError(f"expected a method among {', '.join(METHODS)}, got none")
+    for name in chosen:
+        find_method(name)
+    return chosen
+
+
+def run_study(
+    dataset: Dataset,
+    out: Path,
+    *,
+    methods: Iterable[str] | None = None,
+    n_jobs: int = 1,
+    show_progress: bool = False,
+) -> Run:
+    """Run a data set and put ``metrics.csv``, ``timings.csv``, ``provenance.json`` and tables into ``out``, at once.
+
+    Finished cases are kept beside ``out`` until then: a run that is stopped, however, goes on when it is started again.
+
+    Args:
+        dataset: see `run_dataset`.
+        out: folder of results, new or of an earlier run; files in it that are not a run's stay.
+        methods: names in ``METHODS``; all when None.
+        n_jobs: worker processes.
+        show_progress: bars on standard error.
+
+    Raises:
+        StudyError: as `run_dataset`; a folder that is not a run's or that another process is writing; or no case that
+            succeeded, the rows with the reasons are written then.
+    """
+    chosen = chosen_methods(methods)
+    dataset.pairs()  # nobody to pair leaves no folder
+    with claimed(out) as claim:  # a folder that can't be written is better known now than after the run
+        _run_claimed(dataset, claim, chosen, Workers(n_jobs, show_progress))
+    return _with_values(Run(out))
+
+
+def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Workers) -> None:
+    started = datetime.now(UTC)
+    basis = {
+        **arithmetic(),
+        "dataset": dataset.name,
+        "manifest": sha256_of(dataset.manifest.path),
+        "study": asdict(dataset.params),
+        "seed": dataset.seed,
+    }
+    work = Work(dataset, workers, Journal(claim.journal, basis))
+    rows, timings = all_rows(work, methods)
+    inputs = {dataset.manifest.path.name: basis["manifest"]}
+    inputs |= {key: sha256 for files in work.inputs.values() for key, sha256 in files.items()}
+    parameters = run_parameters(dataset, methods)
+    record = provenance(dataset.name, parameters, dataset.seed, inputs, started, datetime.now(UTC))
+    record["code_sha256"] = basis["code_sha256"]  # that was run, whatever was edited since
+    failures = [f"{' '.join(filter(None, step))}\n{trace}" for step, trace in work.traces.items()]
+    write_run(claim, rows, timings, record, "\n".join(failures))
+
+
+def _with_values(run: Run) -> Run:
+    """A run in which some case succeeded.
+
+    Raises:
+        StudyError: every case failed, with the reasons.
+    """
+    if run.values.empty:
+        raise StudyError(f"{run.dataset}: every case failed: {' | '.join(sorted(set(run.failures['reason'])))}")
+    return run
+
+
+def run_parameters(dataset: Dataset, methods: Iterable[str] | None = None) -> dict[str, Any]:
+    """Every parameter of a run, for its provenance."""
+    chosen = chosen_methods(methods)
+    return {"study": asdict(dataset.params), "methods": {name: asdict(METHODS[name]) for name in chosen}}
+
+
+def why_stale(run: Run, dataset: Dataset) -> str | None:
+    """Why a run cannot stand for one of every method made now, see `Run.why_stale`; None when it can."""
+    inputs = {dataset.manifest.path.name: sha256_of(dataset.manifest.path)}
+    for name in dict.fromkeys(dataset.origin(name) or name for name in dataset.names()):
+        inputs |= input_hashes(dataset, name)
+    return run.why_stale(dataset.name, run_parameters(dataset), dataset.seed, inputs)
+
+
+def open_run(dataset: str, profile: str = "full", seed: int = 0, *, show_progress: bool = False) -> Run:
+    """The run of a data set: its folder's if the code, parameters and inputs of now made it, else a new one.
+
+    A run that another process is making is waited for.
+
+    Args:
+        dataset: name of a data set.
+        profile: ``"full"`` or ``"quick"``.
+        seed: of the run.
+        show_progress: bars on standard error.
+
+    Raises:
+        StudyError: as `run_study`.
+    """
+    chosen = find_dataset(dataset, find_profile(profile), seed)
+    folder = run_folder(chosen.name, profile, seed)
+    reason = why_stale(Run(folder), chosen)
+    if reason is not None:
+        with claimed(folder, wait=True) as claim:
+            reason = why_stale(Run(folder), chosen)  # of now: who was waited for may have made it
+            if reason is not None:
+                _run_claimed(chosen, claim, chosen_methods(None), Workers(min(2, os.cpu_count() or 1), show_progress))
+    made = "loaded: code, parameters and seed are those of now" if reason is None else f"run now: {reason}"
+    return _with_values(Run(folder, made))

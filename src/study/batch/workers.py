@@ -1,0 +1,133 @@
+"""Independent calls in any number of processes; a call that fails is an outcome, and no worker outlives its run."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeVar
+
+from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from study.errors import StudyError
+
+K = TypeVar("K", bound=Hashable)
+Call = tuple[Any, ...]  # a function and its arguments
+WATCH_S = 0.5  # how long a worker may outlive the process that started it
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one call gave, a value or why it failed, and how long it took.
+
+    Attributes:
+        value: of a call that succeeded.
+        error: why it failed.
+        trace: where in the code, of a failure that is no `StudyError`.
+        seconds: it took.
+    """
+
+    value: Any = None
+    error: StudyError | None = None
+    trace: str = ""
+    seconds: float = 0.0
+
+    def get(self) -> Any:
+        """The value.
+
+        Raises:
+            StudyError: the call, or one that it builds on, failed.
+        """
+        if self.error is not None:
+            raise self.error
+        return self.value
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Processes that run independent calls, and a bar that shows how far they are."""
+
+    n_jobs: int
+    show_progress: bool
+
+    def run(
+        self, label: str, calls: Mapping[K, Call], done: Callable[[K, Outcome], None] = lambda *_: None
+    ) -> dict[K, Outcome]:
+        """Run every ``(function, *arguments)``; an argument that is an earlier outcome stands for its value.
+
+        Args:
+            label: of the bar.
+            calls: by key.
+            done: told of each outcome as soon as it is there, in any order.
+
+        Raises:
+            StudyError: a worker process ended before its call did.
+        """
+        keys = list(calls)
+        outcomes: dict[K, Outcome] = {}
+        bar = tqdm(
+            self._outcomes(calls),
+            total=len(calls),
+            desc=label,
+            bar_format="{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed} so far, about {remaining} left",
+            mininterval=0.2 if sys.stderr.isatty() else 15,  # a log file needs a line now and then, not a moving bar
+            disable=not (self.show_progress and calls),
+        )
+        for number, outcome in bar:
+            outcomes[keys[number]] = outcome
+            done(keys[number], outcome)
+        return {key: outcomes[key] for key in keys}
+
+    def _outcomes(self, calls: Mapping[K, Call]) -> Iterator[tuple[int, Outcome]]:
+        if self.n_jobs == 1:
+            yield from ((number, attempt(*call)) for number, call in enumerate(calls.values()))
+            return
+        todo = (delayed(_in_worker)(os.getpid(), number, *call) for number, call in enumerate(calls.values()))
+        try:
+            yield from Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")(todo)
+        except BrokenProcessPool as error:
+            raise StudyError(
+                "expected worker processes to live, got one that ended by itself (is memory short?); finished cases "
+                "are kept: start again to go on, with fewer --jobs"
+            ) from error
+
+
+def attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:
+    """Make one call; a failure of any kind, its own or an argument's, is kept instead of raised."""
+    start = time.perf_counter()
+    value, failure, trace = None, None, ""
+    with threadpool_limits(1):  # sums then have one order, whatever the number of workers
+        try:
+            value = function(*(a.get() if isinstance(a, Outcome) else a for a in arguments))
+        except StudyError as error:
+            failure = StudyError(str(error))
+        except (Exception, SystemExit) as error:  # a bug in one case, here or in a library, is no reason to lose others
+            told = f": {error}" if str(error) else ""
+            failure = StudyError(type(error).__name__ + told)  # the error itself may not survive the way back
+            trace = traceback.format_exc()
+    return Outcome(value, failure, trace, time.perf_counter() - start)
+
+
+def _in_worker(parent: int, number: int, *call: Any) -> tuple[int, Outcome]:
+    _end_with(parent)
+    return number, attempt(*call)
+
+
+@cache
+def _end_with(parent: int) -> None:
+    """Let this worker process end when the one that started it has, however that ended."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
