@@ -236,6 +236,33 @@ def test_the_default_method_keeps_the_rows(clouds: Path, tmp_path: Path, capsys:
     )
 
 
+def test_front_radius_quality_and_warnings(clouds: Path, tmp_path: Path, capsys: Capture) -> None:
+    words = ["register", str(clouds / "ct.ply"), str(clouds / "us.ply"), "--method", "coarse", "--out", "out"]
+    assert main([*words, "--front", "0,1,0", "--radius", "30", "--waypoints", str(clouds / "way.csv")]) == 0
+    said = capsys.readouterr().err
+    summary = json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))
+    assert set(summary["quality"]) == {
+        "residual_share", "wrong_part_share", "further_motion_mm", "stretched_share", "folded_share"
+    }  # fmt: skip
+    assert summary["quality"]["further_motion_mm"] == pytest.approx(0.0, abs=1e-6)  # coarse moves nothing further
+    assert all(f"study: warning: {one}" in said for one in summary["warnings"])
+    line = refused(capsys, *words[:-1], "back", "--front", "0,-1,0")
+    assert "us: expected cartilages that arch towards the `front` given" in line
+    assert "expected three numbers" in refused(capsys, *words[:-1], "back", "--front", "up")
+    assert "--radius" in refused(capsys, *words[:-1], "back", "--radius", "-3")
+    assert not (tmp_path / "back").exists()
+
+
+def test_a_waypoint_far_off_is_named_and_the_others_are_carried(clouds: Path, tmp_path: Path, capsys: Capture) -> None:
+    good = (clouds / "way.csv").read_text().splitlines()
+    (tmp_path / "way.csv").write_text("\n".join([good[0], good[1], "9000,0,0", good[2]]) + "\n")
+    words = ["register", str(clouds / "ct.ply"), str(clouds / "us.ply"), "--method", "coarse", "--out", "out"]
+    assert main([*words, "--waypoints", "way.csv"]) == 0
+    assert "waypoint not carried: line 3: expected at least 3 CT points" in capsys.readouterr().err
+    rows = (tmp_path / "out" / "waypoints_us.csv").read_text(encoding="utf-8").splitlines()
+    assert [row.startswith(",,,") for row in rows] == [False, False, True, False]
+
+
 @pytest.mark.parametrize("fault", ["nan", "metres", "five", "garbage", "flat", "waypoint", "method", "columns"])
 def test_bad_clouds_are_refused_and_leave_nothing(clouds: Path, tmp_path: Path, capsys: Capture, fault: str) -> None:
     points = np.array(read_ply(clouds / "ct.ply"))

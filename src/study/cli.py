@@ -227,7 +227,7 @@ def register(
     ct: Path, us: Path, method: str, waypoints: Path | None, radius: float, front: str | None, seed: int, out: Path
 ) -> None:
     """Register two clouds of one's own (PLY, mm, any rigid pose): sternum and cartilages 2-5, nothing else."""
-    from study.files.clouds import read_ply, read_waypoints, write_registration
+    from study.files.clouds import NOT_CARRIED, read_ply, read_waypoints, write_registration
     from study.pipeline import find_method, register_pair
 
     find_method(method)
@@ -235,7 +235,10 @@ def register(
     towards = None if front is None else _direction(front)
     result = register_pair(read_ply(ct), read_ply(us), method=method, seed=seed, front=towards)
     for line in write_registration(result, out, path, radius):
-        click.echo(line)
+        if line.startswith(NOT_CARRIED):
+            click.echo(f"study: warning: {line}", err=True)
+        else:
+            click.echo(line)
     for warning in [*result.warnings, *([] if result.converged else [f"not converged: {result.stop_reason}"])]:
         click.echo(f"study: warning: {warning}", err=True)
 

@@ -16,6 +16,8 @@ from study.files.atomic import write_bytes, write_text
 from study.registration import Registration, carry_path
 from study.types import Floats, PointCloud, Waypoints, as_points
 
+NOT_CARRIED = "waypoint not carried"
+
 
 def read_ply(path: str | os.PathLike[str]) -> Floats:
     """Points (n, 3) of a PLY file, a cloud or a mesh's vertices.
@@ -130,7 +132,7 @@ def write_registration(
     summary = {
         "method": result.method,
         "converged": result.converged,
-        "warnings": [*result.warnings, *(f"waypoint not carried: {one}" for one in told)],
+        "warnings": [*result.warnings, *(f"{NOT_CARRIED}: {one}" for one in told)],
         "quality": None if result.quality is None else asdict(result.quality),
         "n_iterations": result.n_iterations,
         "stop_reason": result.stop_reason,
@@ -145,4 +147,4 @@ def write_registration(
     if table is not None:
         write_text(folder / "waypoints_us.csv", table.to_csv(index=False, lineterminator="\n"))
         lines.append(f"waypoints in the US frame, mm: {folder / 'waypoints_us.csv'}")
-    return [*lines, *(f"waypoint not carried: {one}" for one in told)]
+    return [*lines, *(f"{NOT_CARRIED}: {one}" for one in told)]
