@@ -31,6 +31,17 @@ def test_the_published_values_are_the_defaults():
     assert method.ct_som.rate == method.us_som.rate == 0.1
 
 
+def test_the_authors_choices_are_their_codes():
+    method = SkeletonGraphMethod.as_authors()
+    assert (method.n_reg, method.neighbours, method.blend_k, method.blend_weights) == (3, "hops", 3, "distance")
+    ct, us = method.ct_som, method.us_som
+    assert (ct.epochs, ct.samples, ct.pretrain_epochs, ct.pretrain_rate) == (5000, 500, 3, 0.02)
+    assert (us.epochs, us.samples, us.pretrain_epochs) == (3000, 130, 0)
+    for som in (ct, us):
+        assert (som.rate, som.rate_schedule) == (0.1, "compounding")
+        assert (som.radius, som.radius_schedule, som.winners) == (5, "compounding", "any")
+
+
 def test_it_is_template_map_map_eq_3_eq_4(pair):
     source, target = pair
     method = replace(QUICK, neighbours="hops")  # 9 or more nodes: no rotation hangs on rounding

@@ -1,10 +1,11 @@
 """Registration methods behind one verb (sec. IV).
 
-``METHODS`` holds them by name, as published or as the library ships them, then tuned:
+``METHODS`` holds them by name, as published or as the library ships them, then tuned, then with every choice of the
+authors' code:
 
     >>> list(METHODS)
     ['coarse', 'icp', 'nonrigid_icp', 'cpd', 'skeleton_graph', \
-'icp_tuned', 'nonrigid_icp_tuned', 'cpd_tuned', 'skeleton_graph_tuned']
+'icp_tuned', 'nonrigid_icp_tuned', 'cpd_tuned', 'skeleton_graph_tuned', 'skeleton_graph_authors']
 
 A method is a frozen dataclass of its parameters, and another setting is another value:
 
@@ -38,8 +39,7 @@ __all__ = [
     "VisibleSurface",
 ]
 
-# The tuned parameters were found on development subjects by tools/tune.py. On those subjects the visible half of the
-# tubes gave every method the smaller waypoint error.
+# The tuned parameters were found on development subjects by tools/tune.py, for each surface by its own grid.
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
         "coarse": CoarseOnly(),
@@ -51,5 +51,6 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "nonrigid_icp_tuned": VisibleSurface(NonrigidIcp.tuned()),
         "cpd_tuned": VisibleSurface(Cpd.tuned()),
         "skeleton_graph_tuned": VisibleSurface(SkeletonGraphMethod.tuned()),
+        "skeleton_graph_authors": SkeletonGraphMethod.as_authors(),
     }
 )
