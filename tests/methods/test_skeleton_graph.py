@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import check_tuned
 from oracles_som import blend_literal, local_transforms_literal
 
 from study.alignment.chest import align
@@ -29,6 +30,11 @@ def test_the_published_values_are_the_defaults():
     method = SkeletonGraphMethod()
     assert (method.n_reg, method.neighbours, method.blend_weights) == (3, "nodes", "distance")
     assert method.ct_som.rate == method.us_som.rate == 0.1
+
+
+def test_the_tuned_settings_are_the_best_of_the_recorded_grids():
+    check_tuned(SkeletonGraphMethod.tuned())
+    check_tuned(SkeletonGraphMethod.tuned_whole(), "_whole")
 
 
 def test_the_authors_choices_are_their_codes():

@@ -1,11 +1,17 @@
 """Registration methods behind one verb (sec. IV).
 
-``METHODS`` holds them by name, as published or as the library ships them, then tuned, then with every choice of the
-authors' code:
+``METHODS`` holds them by name. A method has two sets of parameters, as published (or as its library ships them) and
+tuned, and two surfaces of the CT to register, all of it and the half that a probe can see. A plain name is published
+and whole, the paper's comparison; ``_tuned`` is tuned and visible; the names of the other two say it all:
 
-    >>> list(METHODS)
-    ['coarse', 'icp', 'nonrigid_icp', 'cpd', 'skeleton_graph', \
-'icp_tuned', 'nonrigid_icp_tuned', 'cpd_tuned', 'skeleton_graph_tuned', 'skeleton_graph_authors']
+    >>> [name for name in METHODS if name.startswith("icp")]
+    ['icp', 'icp_tuned', 'icp_visible', 'icp_tuned_whole']
+
+The coarse alignment has neither, and the skeleton graph one row more, with every choice of its authors' code:
+
+    >>> [name for name in METHODS if name.startswith(("coarse", "skeleton"))]
+    ['coarse', 'skeleton_graph', 'skeleton_graph_tuned', 'skeleton_graph_authors', 'skeleton_graph_visible', \
+'skeleton_graph_tuned_whole']
 
 A method is a frozen dataclass of its parameters, and another setting is another value:
 
@@ -52,5 +58,13 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "cpd_tuned": VisibleSurface(Cpd.tuned()),
         "skeleton_graph_tuned": VisibleSurface(SkeletonGraphMethod.tuned()),
         "skeleton_graph_authors": SkeletonGraphMethod.as_authors(),
+        "icp_visible": VisibleSurface(Icp()),
+        "nonrigid_icp_visible": VisibleSurface(NonrigidIcp()),
+        "cpd_visible": VisibleSurface(Cpd()),
+        "skeleton_graph_visible": VisibleSurface(SkeletonGraphMethod()),
+        "icp_tuned_whole": Icp.tuned_whole(),
+        "nonrigid_icp_tuned_whole": NonrigidIcp.tuned_whole(),
+        "cpd_tuned_whole": Cpd.tuned_whole(),
+        "skeleton_graph_tuned_whole": SkeletonGraphMethod.tuned_whole(),
     }
 )

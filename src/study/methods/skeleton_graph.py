@@ -89,6 +89,11 @@ class SkeletonGraphMethod:
         som = SomParams(rate_schedule="linear", winners="own_part")
         return cls(som, som, n_reg=2, neighbours="hops", blend_weights="inverse_distance")
 
+    @classmethod
+    def tuned_whole(cls) -> SkeletonGraphMethod:
+        """The best row of ``results/tuning/skeleton_graph_whole.csv``: the whole tube of the same subjects."""
+        return replace(cls.tuned(), n_reg=1)
+
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> SkeletonRegistration:
         """Register labelled, coarsely aligned clouds.
 
