@@ -228,11 +228,13 @@ class Cohort(_Strict):
     Attributes:
         kind: ``files`` (read from disk) or ``generated`` (made by the study itself).
         reported: whether the study reports it: what `make study` runs and the README's tables show.
+        evidence: whether `make evidence` runs it.
     """
 
     title: Text | None = None
     kind: Literal["files", "generated"] = "files"
     reported: bool = False
+    evidence: bool = False
     subjects: Annotated[dict[Key, SubjectEntry], Field(min_length=1)]
 
 

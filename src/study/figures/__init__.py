@@ -12,6 +12,7 @@ from study.figures import (
     clouds,
     comparisons,
     distributions,
+    evidence,
     graphs,
     registration,
     style,
@@ -23,6 +24,7 @@ from study.figures.canvas import *
 from study.figures.clouds import *
 from study.figures.comparisons import *
 from study.figures.distributions import *
+from study.figures.evidence import *
 from study.figures.graphs import *
 from study.figures.registration import *
 from study.figures.style import *
@@ -35,6 +37,7 @@ __all__ = [
     *clouds.__all__,
     *comparisons.__all__,
     *distributions.__all__,
+    *evidence.__all__,
     *graphs.__all__,
     *registration.__all__,
     *style.__all__,
