@@ -57,7 +57,7 @@ class EvidencePlan:
     ends_only: bool = False
     people: tuple[int, ...] = SEEDS
     methods: tuple[str, ...] = ROBUST_METHODS
-    tried_on: tuple[int, ...] = SEEDS[:12]
+    tried_on: tuple[int, ...] = SEEDS[:10]
     method_seeds: tuple[int, ...] = (0, 1)
     graph: SkeletonGraphMethod = field(default_factory=SkeletonGraphMethod)
     choices: tuple[str, ...] = ()

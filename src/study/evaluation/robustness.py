@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from study.alignment.chest import Alignment, Chest, find_chest
+from study.alignment.chest import Alignment, find_chest
 from study.alignment.sizes import size_warnings
 from study.errors import StudyError
 from study.evaluation.distances import waypoint_errors_mm
@@ -49,7 +49,7 @@ def robustness_rows(disturbance: Disturbance, draw: int, methods: Sequence[str])
     """
     try:
         pair = disturbed_pair(disturbance, draw)
-        alignment, refused = _aligned(pair)
+        alignment, refused = _aligned(pair, disturbance, draw)
     except StudyError as error:
         return [row for method in methods for row in failed_rows(draw, method, error)]
     rows = []
@@ -61,20 +61,17 @@ def robustness_rows(disturbance: Disturbance, draw: int, methods: Sequence[str])
     return rows
 
 
-def _aligned(pair: DisturbedPair) -> tuple[Alignment, str]:
-    """Both chests, and why the start is by hand; empty where it is not."""
+def _aligned(pair: DisturbedPair, disturbance: Disturbance, draw: int) -> tuple[Alignment, str]:
+    """Both chests, and why they were found by hand; empty where they were not."""
     try:
         alignment = Alignment(find_chest(_bare(pair.ct)), find_chest(_bare(pair.us)))
         size_warnings(alignment)
         return alignment, ""
     except StudyError as error:
         refused = str(error)
-    return Alignment(_chest(pair.ct, pair.undisturbed_ct), _chest(pair.us, pair.undisturbed_us)), refused
-
-
-def _chest(cloud: PointCloud, undisturbed: PointCloud) -> Chest:
-    """A cloud with its true parts where the undisturbed one's chest was found."""
-    return replace(find_chest(_bare(undisturbed)), cloud=cloud)
+    careful = disturbed_pair(Disturbance(noise_mm=0.0, deformation=disturbance.deformation), draw)
+    source, target = (find_chest(_bare(cloud)) for cloud in (careful.ct, careful.us))
+    return Alignment(replace(source, cloud=pair.ct), replace(target, cloud=pair.us)), refused
 
 
 def _bare(cloud: PointCloud) -> PointCloud:
