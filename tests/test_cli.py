@@ -27,6 +27,7 @@ from study import params as study_params
 from study import phantom
 from study.cli import main
 from study.ct.parts import parts_from_labels
+from study.datasets import for_evidence
 from study.files.atomic import sha256_of
 from study.files.clouds import read_ply, write_ply
 from study.methods import METHODS
