@@ -47,7 +47,7 @@ class Judgement:
         where a method put it: a method that turns a back to the front gains nothing by it.
 
         Tuned methods register just that part, the others the whole; both are judged on the same points. What remains
-        unlike are strips that the sweep missed, and backs of cells that the front hides only in one of two people.
+        unlike are the strips that the sweep missed, and the rims, where two people's fronts end at different places.
         """
         forth = self.surface.forth[self.pair.visible]
         seen = self.registration.warped[self.pair.visible]
