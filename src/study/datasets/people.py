@@ -18,8 +18,9 @@ from study.files.volumes import read_labels, read_volume
 from study.params import StudyParams
 from study.phantom.deformation import Deformation
 from study.seeds import named_rng
-from study.types import Mesh, PointCloud, RigidTransform, Volume, Waypoints
+from study.types import Floats, Mesh, PointCloud, RigidTransform, Volume, Waypoints
 from study.ultrasound.cloud import SweepReport, sweep_cloud
+from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.sweep_errors import SweepErrors
 from study.ultrasound.tracked import TrackedSweep
 from study.ultrasound.virtual_sweep import simulate_sweep
@@ -64,6 +65,7 @@ class Patient:
         labelled: the same cloud with the parts of the nearest true surface, as the paper's manual segmentation.
         T_us_ras: RAS+ to the tracker's base frame.
         report: frames used and dropped.
+        shift_mm: (3,) mm, base frame, the constant part of the sweep's errors; see `constant_shift_mm`.
     """
 
     anatomy: Anatomy
@@ -71,6 +73,7 @@ class Patient:
     labelled: PointCloud
     T_us_ras: RigidTransform
     report: SweepReport
+    shift_mm: Floats
 
 
 def anatomy_of(name: str, image: Volume, mask: Volume, n_points: int, rng: np.random.Generator) -> Anatomy:
@@ -125,12 +128,13 @@ def make_patient(anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: S
         seed: of the hand, the errors and the base frame.
         errors: what goes wrong; every source at its default size when None.
     """
+    errors = SweepErrors() if errors is None else errors
     T_us_ras = RigidTransform.random(named_rng(seed, f"{anatomy.name}/base"))
     sweep = sweep_over(anatomy, T_us_ras, named_rng(seed, f"{anatomy.name}/sweep"), errors)
     seen = sweep_cloud(sweep, spacing_mm=params.us_spacing_mm)
     cloud = replace(seen.cloud, front=seen.front)
     labelled = replace(cloud, parts=true_parts(T_us_ras.inverse.apply(cloud.points), anatomy.mesh))
-    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report)
+    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report, constant_shift_mm(sweep, errors))
 
 
 def sweep_over(

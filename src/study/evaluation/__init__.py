@@ -14,6 +14,16 @@ from study.evaluation.ablation import (
 from study.evaluation.budget import Budget, Scanned, error_budget
 from study.evaluation.claims import CLAIMS, GRAPH, claims_table, differences
 from study.evaluation.comparisons import paired_tests, protocol_and_truth
+from study.evaluation.controls import (
+    STEPS,
+    TRUE_ERRORS,
+    DecidingPoint,
+    agreement_summary,
+    deciding_point,
+    rank_agreement,
+    truth_floor,
+    truth_free_measures,
+)
 from study.evaluation.distances import (
     CloudDistances,
     directed_distances_mm,
@@ -36,10 +46,13 @@ __all__ = [
     "METRICS",
     "PROTOCOL",
     "RIGID",
+    "STEPS",
+    "TRUE_ERRORS",
     "TRUE_IN_PLANE",
     "TRUTH",
     "Budget",
     "CloudDistances",
+    "DecidingPoint",
     "Judgement",
     "Metric",
     "Option",
@@ -50,11 +63,13 @@ __all__ = [
     "Scanned",
     "Unit",
     "ablate",
+    "agreement_summary",
     "align_pair",
     "beyond_luck",
     "changes",
     "check_pose",
     "claims_table",
+    "deciding_point",
     "differences",
     "directed_distances_mm",
     "error_budget",
@@ -70,7 +85,10 @@ __all__ = [
     "population_sd",
     "protocol_and_truth",
     "random_pose",
+    "rank_agreement",
     "sampling_floor_mm",
+    "truth_floor",
+    "truth_free_measures",
     "try_poses",
     "waypoint_errors_mm",
 ]
