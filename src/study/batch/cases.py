@@ -15,6 +15,7 @@ from study.evaluation.metrics import judge
 from study.evaluation.pair import TRUTH, Pair, perfect
 from study.files.atomic import sha256_of
 from study.methods import METHODS
+from study.naming import split_sweep
 from study.pipeline import find_method, register_aligned
 from study.results.journal import Journal
 from study.results.metrics_csv import TIMING_COLUMNS, Case, Row, failed_row, metric_rows
@@ -69,7 +70,7 @@ class Work:
         return {
             "step": list(step),
             "method": asdict(METHODS[step.method]) if step.method in METHODS else None,
-            "inputs": {name: self.inputs[self.dataset.origin(name) or name] for name in people},
+            "inputs": {name: self.inputs[_read_as(self.dataset, name)] for name in people},
         }
 
 
@@ -118,9 +119,9 @@ def _pairs(work: Work, fetched: Mapping[str, Outcome], chosen: list[tuple[str, s
     dataset = work.dataset
     sources = list(dict.fromkeys(source for source, _ in chosen))
     targets = list(dict.fromkeys(target for _, target in chosen))
-    anatomies = _anatomies(work, fetched, list(dict.fromkeys([*sources, *targets])))
+    anatomies = _anatomies(work, fetched, list(dict.fromkeys([*sources, *map(_swept, targets)])))
     patients = work.do(
-        "virtual sweeps", {_person(name, "sweep"): (dataset.patient, name, anatomies[name]) for name in targets}
+        "virtual sweeps", {_person(name, "sweep"): (dataset.patient, name, anatomies[_swept(name)]) for name in targets}
     )
     chests = work.do(
         "coarse alignment",
@@ -162,9 +163,21 @@ def _person(name: str, stage: str) -> Step:
     return Step(name, "", "", stage)
 
 
+def _swept(patient: str) -> str:
+    """The anatomy of a patient, whichever sweep it is."""
+    return split_sweep(patient)[0]
+
+
+def _read_as(dataset: Dataset, name: str) -> str:
+    """Who is read from files when the CT, patient or sweep of a patient called ``name`` is needed."""
+    anatomy = _swept(name)
+    return dataset.origin(anatomy) or anatomy
+
+
 def _people_steps(pairs: list[tuple[str, str]], own: list[str]) -> list[Step]:
     sources, targets = (dict.fromkeys(names) for names in zip(*pairs, strict=True))
-    stages = {"anatomy": {**dict.fromkeys(own), **sources, **targets}, "sweep": targets}
+    swept = dict.fromkeys(map(_swept, targets))
+    stages = {"anatomy": {**dict.fromkeys(own), **sources, **swept}, "sweep": targets}
     stages |= {"coarse ct": sources, "coarse us": targets}
     return [_person(name, stage) for stage, names in stages.items() for name in names]
 
