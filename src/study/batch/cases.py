@@ -41,6 +41,7 @@ class Work:
         journal: of finished steps.
         inputs: SHA-256 of the files of each person of their own, by name and key.
         traces: where in the code steps failed that nobody foresaw.
+        peak_mb: the most memory that one process held in a finished step, now or before a run was stopped.
     """
 
     dataset: Dataset
@@ -48,6 +49,7 @@ class Work:
     journal: Journal
     inputs: dict[str, dict[str, str]] = field(default_factory=dict)
     traces: dict[Step, str] = field(default_factory=dict)
+    peak_mb: float = 0.0
 
     def do(self, label: str, calls: Mapping[Step, Call]) -> dict[Step, Outcome]:
         """Do steps; a finished one is kept at once."""
@@ -56,12 +58,16 @@ class Work:
     def finished(self, step: Step) -> Outcome | None:
         """A step that was done, now or before a run was stopped; its value where it is rows."""
         piece = self.journal.get(self._facts(step))
-        return None if piece is None else Outcome(piece["rows"], seconds=piece["seconds"])
+        if piece is None:
+            return None
+        self.peak_mb = max(self.peak_mb, piece["peak_mb"])
+        return Outcome(piece["rows"], seconds=piece["seconds"], peak_mb=piece["peak_mb"])
 
     def _done(self, step: Step, outcome: Outcome) -> None:
         if outcome.error is None:  # what failed is tried again: it may have been the network, or memory
             rows = outcome.value if step.stage == "register" else None
-            self.journal.keep(self._facts(step), {"rows": rows, "seconds": outcome.seconds})
+            kept = {"rows": rows, "seconds": outcome.seconds, "peak_mb": outcome.peak_mb}
+            self.journal.keep(self._facts(step), kept)
         elif outcome.trace:
             self.traces[step] = outcome.trace
 

@@ -91,12 +91,6 @@ def weighted_mean(values: Floats, weights: Floats) -> Floats:
     return np.asarray(weights @ values[:, 0] / weights.sum(axis=1))
 
 
-def weighted_sd(values: Floats, weights: Floats) -> Floats:
-    """Population SD (draws,) of values (n, 1) with weights (draws, n), as the paper's Table I has it."""
-    mean = weighted_mean(values, weights)
-    return np.asarray(np.sqrt(np.einsum("dn,dn->d", weights, (values[:, 0] - mean[:, None]) ** 2) / weights.sum(axis=1)))
-
-
 def over_people(
     table: pd.DataFrame | pd.Series, statistic: Statistic = weighted_mean, *, seed: int = 0, n_draws: int = N_DRAWS
 ) -> Interval:
@@ -127,11 +121,11 @@ def over_people(
     return Interval(value, float(low), float(high), len(cells), n_people)
 
 
-def draw_weights(pairs: pd.MultiIndex, rng: np.random.Generator, n_draws: int) -> tuple[Floats, int]:
+def draw_weights(pairs: pd.Index, rng: np.random.Generator, n_draws: int) -> tuple[Floats, int]:
     """How often each pair of people counts when people are drawn with replacement.
 
     Args:
-        pairs: the two people of each pair; somebody paired with a deformation of themselves counts once.
+        pairs: two levels, the people of each pair; somebody paired with a deformation of themselves counts once.
         rng: of the draws.
         n_draws: how many; those in which no pair is left are dropped.
 
@@ -146,7 +140,8 @@ def draw_weights(pairs: pd.MultiIndex, rng: np.random.Generator, n_draws: int) -
     for role in drawn:
         of_role = rng.multinomial(len(role), np.full(len(role), 1 / len(role)), size=n_draws)
         counts |= dict(zip(role, of_role.T.astype(np.float64), strict=True))
-    weights = np.stack([counts[a] * (1 if a == b else counts[b]) for a, b in zip(sources, targets, strict=True)], axis=1)
+    ends = zip(sources, targets, strict=True)
+    weights = np.stack([counts[a] if a == b else counts[a] * counts[b] for a, b in ends], axis=1)
     return weights[weights.any(axis=1)], min((len(role) for role in drawn), default=0)
 
 
@@ -160,7 +155,8 @@ def mean_intervals(per_pair: pd.DataFrame, **how: Any) -> pd.DataFrame:
     Returns:
         index method; columns ``value``, ``low``, ``high``, ``n_pairs``, ``n_people``, ``is_rough``.
     """
-    found = {name: over_people(per_pair[name].dropna(), **how) for name in per_pair if per_pair[name].notna().any()}
+    present = [name for name in per_pair if per_pair[name].notna().any()]
+    found = {str(name): over_people(per_pair[name].dropna(), **how) for name in present}
     return _as_table(found)
 
 

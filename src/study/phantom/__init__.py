@@ -10,9 +10,9 @@ from study.phantom.truth import measures, truth_map, waypoints
 __all__ = [
     "CARTILAGE_ID",
     "LEFT_RIB_ID",
+    "POPULATION",
     "RIGHT_RIB_ID",
     "STERNUM_ID",
-    "POPULATION",
     "SUBJECTS",
     "Affine",
     "Bumps",

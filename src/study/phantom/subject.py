@@ -70,7 +70,9 @@ def draw_subject(name: str, seed: int, max_sd: float = MAX_SD) -> SyntheticSubje
     if name not in (*SUBJECTS, *POPULATION):
         raise StudyError(f"expected a phantom subject of {', '.join((*SUBJECTS, *POPULATION))}, got {name!r}")
     if not max_sd > 0:
-        raise StudyError(f"expected max_sd > 0, got {max_sd:g}; {MAX_SD} is the reported cohort's, inf the whole spread")
+        raise StudyError(
+            f"expected max_sd > 0, got {max_sd:g}; {MAX_SD} is the reported cohort's, inf the whole spread"
+        )
     person = [seed, crc32(name.encode())]
     if max_sd <= MAX_SD:  # where every draw can be inverted
         return _draw(name, seed, max_sd, np.random.default_rng(person))

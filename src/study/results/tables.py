@@ -16,7 +16,6 @@ from study.files.places import shipped
 from study.naming import natural_key, split_sweep
 from study.results.metrics_csv import CASE, KEY, NOT_CONVERGED
 
-
 MOST_TABLES = 6  # of one patient each
 
 
