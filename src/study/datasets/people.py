@@ -15,6 +15,7 @@ from study.errors import StudyError
 from study.evaluation.waypoints import intercostal_waypoints
 from study.files.landmarks import read_landmarks
 from study.files.volumes import read_labels, read_volume
+from study.naming import sweep_name
 from study.params import StudyParams
 from study.phantom.deformation import Deformation
 from study.seeds import named_rng
@@ -66,6 +67,7 @@ class Patient:
         T_us_ras: RAS+ to the tracker's base frame.
         report: frames used and dropped.
         shift_mm: (3,) mm, base frame, the constant part of the sweep's errors; see `constant_shift_mm`.
+        sweep: its number among the sweeps of this anatomy.
     """
 
     anatomy: Anatomy
@@ -74,6 +76,12 @@ class Patient:
     T_us_ras: RigidTransform
     report: SweepReport
     shift_mm: Floats
+    sweep: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of the patient in this sweep, see `study.naming.sweep_name`."""
+        return sweep_name(self.anatomy.name, self.sweep)
 
 
 def anatomy_of(name: str, image: Volume, mask: Volume, n_points: int, rng: np.random.Generator) -> Anatomy:
@@ -119,7 +127,9 @@ def read_anatomy(
     return anatomy_of(image.name, image, mask, n_points, rng)
 
 
-def make_patient(anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: SweepErrors | None = None) -> Patient:
+def make_patient(
+    anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: SweepErrors | None = None, sweep: int = 0
+) -> Patient:
     """Sweep an anatomy with a virtual tracked probe whose base frame is anywhere (sec. II-C.2).
 
     Args:
@@ -127,14 +137,16 @@ def make_patient(anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: S
         params: density of the cloud.
         seed: of the hand, the errors and the base frame.
         errors: what goes wrong; every source at its default size when None.
+        sweep: its number; another one has a hand, errors and a base frame of its own.
     """
     errors = SweepErrors() if errors is None else errors
-    T_us_ras = RigidTransform.random(named_rng(seed, f"{anatomy.name}/base"))
-    sweep = sweep_over(anatomy, T_us_ras, named_rng(seed, f"{anatomy.name}/sweep"), errors)
-    seen = sweep_cloud(sweep, spacing_mm=params.us_spacing_mm)
+    name = sweep_name(anatomy.name, sweep)
+    T_us_ras = RigidTransform.random(named_rng(seed, f"{name}/base"))
+    tracked = sweep_over(anatomy, T_us_ras, named_rng(seed, f"{name}/sweep"), errors)
+    seen = sweep_cloud(tracked, spacing_mm=params.us_spacing_mm)
     cloud = replace(seen.cloud, front=seen.front)
     labelled = replace(cloud, parts=true_parts(T_us_ras.inverse.apply(cloud.points), anatomy.mesh))
-    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report, constant_shift_mm(sweep, errors))
+    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report, constant_shift_mm(tracked, errors), sweep)
 
 
 def sweep_over(

@@ -12,8 +12,9 @@ from study.evaluation.ablation import (
     options,
 )
 from study.evaluation.budget import Budget, Scanned, error_budget
-from study.evaluation.claims import CLAIMS, GRAPH, claims_table, differences
-from study.evaluation.comparisons import paired_tests, protocol_and_truth
+from study.evaluation.claim_questions import GRAPH
+from study.evaluation.claims import CLAIMS, claims_table, differences, with_minutes
+from study.evaluation.comparisons import protocol_and_truth
 from study.evaluation.controls import (
     STEPS,
     TRUE_ERRORS,
@@ -32,11 +33,12 @@ from study.evaluation.distances import (
     sampling_floor_mm,
     waypoint_errors_mm,
 )
+from study.evaluation.intervals import Interval, difference_intervals, mean_intervals, over_people, paired_intervals
 from study.evaluation.judgement import Judgement
 from study.evaluation.metrics import METRICS, Metric, Unit, judge
 from study.evaluation.pair import TRUTH, Pair, align_pair, in_order, perfect
 from study.evaluation.poses import PoseCheck, PoseTrial, check_pose, random_pose, try_poses
-from study.evaluation.statistics import PairedTest, paired_wilcoxon, population_sd
+from study.evaluation.statistics import population_sd
 from study.evaluation.waypoints import intercostal_waypoints
 
 __all__ = [
@@ -53,11 +55,11 @@ __all__ = [
     "Budget",
     "CloudDistances",
     "DecidingPoint",
+    "Interval",
     "Judgement",
     "Metric",
     "Option",
     "Pair",
-    "PairedTest",
     "PoseCheck",
     "PoseTrial",
     "Scanned",
@@ -70,6 +72,7 @@ __all__ = [
     "check_pose",
     "claims_table",
     "deciding_point",
+    "difference_intervals",
     "differences",
     "directed_distances_mm",
     "error_budget",
@@ -77,9 +80,10 @@ __all__ = [
     "in_order",
     "intercostal_waypoints",
     "judge",
+    "mean_intervals",
     "options",
-    "paired_tests",
-    "paired_wilcoxon",
+    "over_people",
+    "paired_intervals",
     "perfect",
     "point_errors_mm",
     "population_sd",
@@ -91,4 +95,5 @@ __all__ = [
     "truth_free_measures",
     "try_poses",
     "waypoint_errors_mm",
+    "with_minutes",
 ]
