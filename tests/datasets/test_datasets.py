@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,15 +25,22 @@ from study.datasets import (
     CohortDataset,
     Dataset,
     PlantedDataset,
+    PlantedEveryDataset,
+    PopulationDataset,
     find_dataset,
     make_patient,
     read_anatomy,
     reported,
+    sweep_over,
 )
 from study.datasets.planted import SIZES_MM, plant
 from study.errors import StudyError
-from study.params import PHANTOM_SEED, PROFILES, StudyParams
+from study.naming import person_of
+from study.params import PHANTOM_SEED, POPULATION_SEED, PROFILES, StudyParams
+from study.seeds import named_rng
 from study.types import PointCloud
+from study.ultrasound.constant_shift import constant_shift_mm
+from study.ultrasound.sweep_errors import SweepErrors
 
 
 def pairs(name: str, params: StudyParams, manifest: Manifest | None = None) -> list[tuple[str, str]]:
@@ -112,7 +120,7 @@ def test_ones_own_scans_never_have_a_known_truth_whatever_their_name(tmp_path: P
 
 
 def test_a_generated_cohort_that_nothing_makes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StudyError, match=r"generated cohort among phantom, planted, got 'robots'"):
+    with pytest.raises(StudyError, match=r"among phantom, planted, population, planted_every, got 'robots'"):
         find_dataset("robots", manifest=manifest_of(tmp_path, {"a": {}, "b": {}}, cohort="robots"))
 
 
@@ -139,6 +147,112 @@ def test_names_and_origins() -> None:
     assert find_dataset("open").file_cohort == "open"
     with pytest.raises(StudyError, match="got 'ct9'"):
         planted.origin("ct9")
+
+
+# --- more people, more sweeps ----------------------------------------------------------------------------------------
+
+
+def test_the_population_is_a_design_in_which_everybody_is_both_equally_often() -> None:
+    people = find_dataset("population")
+    found = people.pairs()
+    assert len(found) == len(set(found)) == 72
+    who = Counter((source, person_of(target)) for source, target in found)
+    assert set(who.values()) == {2}  # sweeps
+    assert all(source != target and (target, source) not in who for source, target in who)
+    assert set(Counter(source for source, _ in who).values()) == {3}
+    assert set(Counter(target for _, target in who).values()) == {3}
+    assert set(people.names()) == set(people.with_ct()) == set(phantom.POPULATION)
+    assert people.has_truth
+    quick = pairs("population", PROFILES["quick"])
+    assert len(quick) == 4
+    assert {person_of(target) for _, target in quick} == {"p01"}
+
+
+def test_population_people_are_drawn_from_the_whole_spread() -> None:
+    people = find_dataset("population", SMALL)
+    assert isinstance(people, PopulationDataset)
+    points = np.zeros((1, 3))
+    whole = phantom.draw_subject("p03", POPULATION_SEED, np.inf)
+    assert np.array_equal(people.draw("p03").phi.apply(points), whole.phi.apply(points))
+    truth = people.truth("p03", "p04")
+    other = phantom.draw_subject("p04", POPULATION_SEED, np.inf)
+    assert np.allclose(truth(phantom.waypoints(whole).points), phantom.waypoints(other).points, atol=1e-6)
+    with pytest.raises(StudyError, match="got 'ct1'"):
+        people.draw("ct1")
+
+
+def test_a_cohort_says_how_many_atlases_and_sweeps(tmp_path: Path) -> None:
+    raw = {"kind": "generated", "sweeps": 2, "atlases": 2, "subjects": {name: {} for name in "abcde"}}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump({"cohorts": {"phantom": raw}}))
+    people = find_dataset("phantom", manifest=load_manifest(tmp_path / "own.yaml"))
+    assert [pair for pair in people.pairs() if person_of(pair[1]) == "d"] == [
+        ("e", "d"), ("b", "d"), ("e", "d#1"), ("b", "d#1"),
+    ]  # fmt: skip
+    assert set(Counter(source for source, _ in people.pairs()).values()) == {4}
+    with pytest.raises(StudyError, match=r"one of 2 sweep\(s\), numbered from 0, got 'd#2'"):
+        people.patient("d#2")
+    with pytest.raises(StudyError, match="got 'f'"):
+        people.patient("f#1")
+    for field in ("sweeps", "atlases"):
+        (tmp_path / "bad.yaml").write_text(yaml.safe_dump({"cohorts": {"phantom": {**raw, field: -1}}}))
+        with pytest.raises(StudyError, match=field):
+            load_manifest(tmp_path / "bad.yaml")
+
+
+def test_open_sweeps_are_the_people_of_open_and_their_first_sweep_is_its(one: Anatomy) -> None:
+    swept, single = find_dataset("open_sweeps"), find_dataset("open")
+    assert len(swept.pairs()) == 3 * len(single.pairs())
+    assert set(single.pairs()) < set(swept.pairs())
+    assert swept.names() == single.names()
+    assert swept.file_cohort == single.file_cohort == "open"
+    assert swept.manifest.cohort("open_sweeps").subjects == swept.manifest.cohort("open").subjects
+    person = replace(one, name="lung1")
+    small = find_dataset("open_sweeps", SMALL)
+    first, second, again = (small.patient(name, person) for name in ("lung1", "lung1#1", "lung1#1"))
+    alone = make_patient(person, SMALL)
+    assert (first.name, second.name) == ("lung1", "lung1#1")
+    assert np.array_equal(first.cloud.points, alone.cloud.points)
+    assert np.array_equal(first.T_us_ras.matrix, alone.T_us_ras.matrix)
+    assert np.array_equal(second.cloud.points, again.cloud.points)
+    assert not np.allclose(first.T_us_ras.matrix, second.T_us_ras.matrix)
+    back = [one.T_us_ras.inverse.apply(one.cloud.points) for one in (first, second)]
+    assert not np.array_equal(back[0][:50], back[1][:50])  # another hand, not only another frame
+    assert small.pair(replace(one, name="lung2"), second).name == "lung2/lung1#1"
+
+
+def test_the_clouds_of_one_person_are_the_same_in_both_cohorts(tmp_path: Path) -> None:
+    path = own_manifest(tmp_path, names=("ct1",))
+    raw = yaml.safe_load(path.read_text())
+    raw["cohorts"]["more"] = {**raw["cohorts"]["mine"], "people_of": "mine", "sweeps": 2}
+    raw["cohorts"]["other"] = raw["cohorts"]["mine"]
+    path.write_text(yaml.safe_dump(raw))
+    mine, more, other = (
+        load_anatomy(cohort, "ct1", SMALL, manifest=load_manifest(path)).cloud.points
+        for cohort in ("mine", "more", "other")
+    )
+    assert np.array_equal(mine, more)
+    assert not np.array_equal(mine, other)
+
+
+def test_every_real_ct_has_planted_patients_of_its_own(one: Anatomy) -> None:
+    people = find_dataset("planted_every")
+    assert isinstance(people, PlantedEveryDataset)
+    names = list(load_manifest().cohort("open").subjects)
+    assert people.pairs() == [(name, f"{name}+{kind}") for name in names for kind in SIZES_MM]
+    assert people.origin("lung1+planted2") == "lung1"
+    assert people.origin("lung1") is None
+    assert people.with_ct() == names
+    for unknown in ("lung1+planted9", "lung9", "planted1", "lung9+planted1", "lung1+"):
+        with pytest.raises(StudyError, match="got"):
+            people.origin(unknown)
+    person = replace(one, name="lung1")
+    first = people.anatomy("lung1+planted2", person)
+    other = people.anatomy("lung2+planted2", person)
+    truth = people.truth(person, first)
+    assert first.name == "lung1+planted2"
+    assert np.array_equal(first.cloud.points, truth(person.cloud.points))
+    assert not np.allclose(first.cloud.points, other.cloud.points)  # each has draws of its own
+    assert np.array_equal(plant(one, "planted2").cloud.points, plant(one, "planted2").cloud.points)
 
 
 # --- anatomies -------------------------------------------------------------------------------------------------------
@@ -280,3 +394,11 @@ def test_a_patient_is_seen_from_the_front_in_a_frame_of_its_own(one: Anatomy) ->
     assert not np.allclose(other.T_us_ras.matrix, patient.T_us_ras.matrix)
     again = make_patient(one, SMALL)
     assert np.array_equal(again.cloud.points, patient.cloud.points)
+
+
+@pytest.mark.parametrize("errors", [None, SweepErrors.only("calibration"), SweepErrors.none()])
+def test_a_patient_knows_the_constant_part_of_its_sweeps_errors(one: Anatomy, errors: SweepErrors | None) -> None:
+    patient = make_patient(one, SMALL, errors=errors)
+    sweep = sweep_over(one, patient.T_us_ras, named_rng(0, f"{one.name}/sweep"), errors)
+    assert np.array_equal(patient.shift_mm, constant_shift_mm(sweep, errors or SweepErrors()))
+    assert (np.linalg.norm(patient.shift_mm) > 0.4) == (errors != SweepErrors.none())

@@ -15,6 +15,7 @@ from study.evaluation.metrics import judge
 from study.evaluation.pair import TRUTH, Pair, perfect
 from study.files.atomic import sha256_of
 from study.methods import METHODS
+from study.naming import split_sweep
 from study.pipeline import find_method, register_aligned
 from study.results.journal import Journal
 from study.results.metrics_csv import TIMING_COLUMNS, Case, Row, failed_row, metric_rows
@@ -40,6 +41,7 @@ class Work:
         journal: of finished steps.
         inputs: SHA-256 of the files of each person of their own, by name and key.
         traces: where in the code steps failed that nobody foresaw.
+        peak_mb: the most memory that one process held in a finished step, now or before a run was stopped.
     """
 
     dataset: Dataset
@@ -47,6 +49,7 @@ class Work:
     journal: Journal
     inputs: dict[str, dict[str, str]] = field(default_factory=dict)
     traces: dict[Step, str] = field(default_factory=dict)
+    peak_mb: float = 0.0
 
     def do(self, label: str, calls: Mapping[Step, Call]) -> dict[Step, Outcome]:
         """Do steps; a finished one is kept at once."""
@@ -55,12 +58,16 @@ class Work:
     def finished(self, step: Step) -> Outcome | None:
         """A step that was done, now or before a run was stopped; its value where it is rows."""
         piece = self.journal.get(self._facts(step))
-        return None if piece is None else Outcome(piece["rows"], seconds=piece["seconds"])
+        if piece is None:
+            return None
+        self.peak_mb = max(self.peak_mb, piece["peak_mb"])
+        return Outcome(piece["rows"], seconds=piece["seconds"], peak_mb=piece["peak_mb"])
 
     def _done(self, step: Step, outcome: Outcome) -> None:
         if outcome.error is None:  # what failed is tried again: it may have been the network, or memory
             rows = outcome.value if step.stage == "register" else None
-            self.journal.keep(self._facts(step), {"rows": rows, "seconds": outcome.seconds})
+            kept = {"rows": rows, "seconds": outcome.seconds, "peak_mb": outcome.peak_mb}
+            self.journal.keep(self._facts(step), kept)
         elif outcome.trace:
             self.traces[step] = outcome.trace
 
@@ -69,7 +76,7 @@ class Work:
         return {
             "step": list(step),
             "method": asdict(METHODS[step.method]) if step.method in METHODS else None,
-            "inputs": {name: self.inputs[self.dataset.origin(name) or name] for name in people},
+            "inputs": {name: self.inputs[_read_as(self.dataset, name)] for name in people},
         }
 
 
@@ -118,9 +125,9 @@ def _pairs(work: Work, fetched: Mapping[str, Outcome], chosen: list[tuple[str, s
     dataset = work.dataset
     sources = list(dict.fromkeys(source for source, _ in chosen))
     targets = list(dict.fromkeys(target for _, target in chosen))
-    anatomies = _anatomies(work, fetched, list(dict.fromkeys([*sources, *targets])))
+    anatomies = _anatomies(work, fetched, list(dict.fromkeys([*sources, *map(_swept, targets)])))
     patients = work.do(
-        "virtual sweeps", {_person(name, "sweep"): (dataset.patient, name, anatomies[name]) for name in targets}
+        "virtual sweeps", {_person(name, "sweep"): (dataset.patient, name, anatomies[_swept(name)]) for name in targets}
     )
     chests = work.do(
         "coarse alignment",
@@ -162,9 +169,21 @@ def _person(name: str, stage: str) -> Step:
     return Step(name, "", "", stage)
 
 
+def _swept(patient: str) -> str:
+    """The anatomy of a patient, whichever sweep it is."""
+    return split_sweep(patient)[0]
+
+
+def _read_as(dataset: Dataset, name: str) -> str:
+    """Who is read from files when the CT, patient or sweep of a patient called ``name`` is needed."""
+    anatomy = _swept(name)
+    return dataset.origin(anatomy) or anatomy
+
+
 def _people_steps(pairs: list[tuple[str, str]], own: list[str]) -> list[Step]:
     sources, targets = (dict.fromkeys(names) for names in zip(*pairs, strict=True))
-    stages = {"anatomy": {**dict.fromkeys(own), **sources, **targets}, "sweep": targets}
+    swept = dict.fromkeys(map(_swept, targets))
+    stages = {"anatomy": {**dict.fromkeys(own), **sources, **swept}, "sweep": targets}
     stages |= {"coarse ct": sources, "coarse us": targets}
     return [_person(name, stage) for stage, names in stages.items() for name in names]
 
@@ -179,7 +198,9 @@ def _chest(person: Anatomy | Patient) -> Chest:
 
 
 def _pair(dataset: Dataset, source: Anatomy, patient: Patient, ct: Chest, us: Chest) -> Pair:
-    return dataset.pair(source, patient, (ct, us))
+    pair = dataset.pair(source, patient, (ct, us))
+    _ = pair.visible_waypoints_ct  # kept on the pair: found here once, not by every method's worker
+    return pair
 
 
 def run_case(case: Case, pair: Pair, radius_mm: float) -> list[Row]:

@@ -103,6 +103,7 @@ def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Wo
     inputs |= {key: sha256 for files in work.inputs.values() for key, sha256 in files.items()}
     parameters = run_parameters(dataset, methods)
     record = provenance(dataset.name, parameters, dataset.seed, inputs, started, datetime.now(UTC))
+    record["peak_memory_mb"] = round(work.peak_mb)  # of one process; the timing rows have asked for every step
     record["code_sha256"] = basis["code_sha256"]  # that was run, whatever was edited since
     failures = [f"{' '.join(filter(None, step))}\n{trace}" for step, trace in work.traces.items()]
     write_run(claim, rows, timings, record, "\n".join(failures))

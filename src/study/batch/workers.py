@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import sys
 import threading
 import time
@@ -33,12 +34,14 @@ class Outcome:
         error: why it failed.
         trace: where in the code, of a failure that is no `StudyError`.
         seconds: it took.
+        peak_mb: the most memory that its process had held by then.
     """
 
     value: Any = None
     error: StudyError | None = None
     trace: str = ""
     seconds: float = 0.0
+    peak_mb: float = 0.0
 
     def get(self) -> Any:
         """The value.
@@ -113,7 +116,13 @@ def attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:
             told = f": {error}" if str(error) else ""
             failure = StudyError(type(error).__name__ + told)  # the error itself may not survive the way back
             trace = traceback.format_exc()
-    return Outcome(value, failure, trace, time.perf_counter() - start)
+    return Outcome(value, failure, trace, time.perf_counter() - start, _peak_mb())
+
+
+def _peak_mb() -> float:
+    """The most memory this process has held so far; the system counts in kB, on macOS in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(peak / (2**20 if sys.platform == "darwin" else 2**10))
 
 
 def _in_worker(parent: int, number: int, *call: Any) -> tuple[int, Outcome]:

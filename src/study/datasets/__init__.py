@@ -12,8 +12,8 @@ from study.datasets.cohort import CohortDataset
 from study.datasets.cut import Cut
 from study.datasets.dataset import Dataset, TruthMap
 from study.datasets.people import FRONT, Anatomy, Patient, anatomy_of, make_patient, read_anatomy, sweep_over
-from study.datasets.phantoms import PhantomDataset
-from study.datasets.planted import PlantedDataset
+from study.datasets.phantoms import PhantomDataset, PopulationDataset
+from study.datasets.planted import PlantedDataset, PlantedEveryDataset
 from study.errors import StudyError
 from study.params import StudyParams
 
@@ -27,6 +27,8 @@ __all__ = [
     "Patient",
     "PhantomDataset",
     "PlantedDataset",
+    "PlantedEveryDataset",
+    "PopulationDataset",
     "TruthMap",
     "anatomy_of",
     "find_dataset",
@@ -38,7 +40,14 @@ __all__ = [
 ]
 
 # Cohorts of the manifest that are not read but made: their name decides by whom.
-GENERATED: Mapping[str, type[Dataset]] = MappingProxyType({"phantom": PhantomDataset, "planted": PlantedDataset})
+GENERATED: Mapping[str, type[Dataset]] = MappingProxyType(
+    {
+        "phantom": PhantomDataset,
+        "planted": PlantedDataset,
+        "population": PopulationDataset,
+        "planted_every": PlantedEveryDataset,
+    }
+)
 
 
 def find_dataset(

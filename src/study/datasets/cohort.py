@@ -29,7 +29,7 @@ class CohortDataset(Dataset):
         """See `Dataset.anatomy`; files are fetched where they are missing."""
         self.require(name)
         image, mask = read_subject(self.manifest, self.manifest.cohort(self.name).subjects[name])
-        rng = named_rng(self.seed, f"{self.name}/{name}/anatomy")
+        rng = named_rng(self.seed, f"{self.file_cohort}/{name}/anatomy")
         return anatomy_of(name, image, mask, self.params.ct_points, rng)
 
     def truth(self, source: str | Anatomy, target: str | Anatomy) -> None:

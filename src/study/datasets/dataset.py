@@ -16,6 +16,7 @@ from study.datasets.cut import Cut
 from study.datasets.people import Anatomy, Patient, make_patient
 from study.errors import StudyError
 from study.evaluation.pair import Pair, align_pair
+from study.naming import split_sweep, sweep_name
 from study.params import StudyParams
 from study.seeds import named_rng
 from study.types import Floats, Volume
@@ -50,8 +51,8 @@ class Dataset(ABC):
 
     @property
     def file_cohort(self) -> str:
-        """The manifest's cohort that its files belong to."""
-        return self.name
+        """The manifest's cohort that its people and their files belong to."""
+        return self.manifest.cohort(self.name).people_of or self.name
 
     def sources(self) -> list[str]:
         """Who can be the CT."""
@@ -65,25 +66,41 @@ class Dataset(ABC):
         return names[: self.params.max_targets or None]
 
     def pairs(self) -> list[tuple[str, str]]:
-        """The (CT, patient) pairs, patient by patient; nobody is paired with themselves.
+        """The (CT, patient) pairs, patient by patient and sweep by sweep; nobody is paired with themselves.
+
+        A patient's name says the sweep, see `study.naming.sweep_name`.
 
         Raises:
             StudyError: nobody to pair.
         """
         chosen: list[tuple[str, str]] = []
         for target in self.targets():
-            others = [source for source in self.sources() if source != target]
-            chosen += [(source, target) for source in others[: self.params.max_sources or None]]
+            atlases = self.atlases(target)[: self.params.max_sources or None]
+            for sweep in range(self.manifest.cohort(self.name).sweeps):
+                chosen += [(source, sweep_name(target, sweep)) for source in atlases]
         if not chosen:
             raise StudyError(
                 f"dataset {self.name!r}: expected two subjects or more, one of them a patient; got none to pair"
             )
         return chosen
 
+    def atlases(self, target: str) -> list[str]:
+        """Whose CTs are registered to a patient: all others, or as many as the cohort asks for, evenly around a circle.
+
+        Around the circle of people each patient has the CTs at the same few distances, so that in a cohort in which
+        everybody is both, everybody is a CT as often as a patient.
+        """
+        sources, wanted = self.sources(), self.manifest.cohort(self.name).atlases
+        start = sources.index(target) + 1 if target in sources else 0
+        others = [name for name in (*sources[start:], *sources[:start]) if name != target]
+        if not wanted or wanted >= len(others):
+            return [source for source in sources if source != target]
+        return [others[round(k * len(others) / wanted)] for k in range(wanted)]
+
     def names(self) -> list[str]:
-        """Everybody who takes part in a pair, each once, the CTs first."""
+        """Everybody who takes part in a pair, each once, the CTs first; a patient once for all sweeps."""
         sources, targets = zip(*self.pairs(), strict=True)
-        return list(dict.fromkeys([*sources, *targets]))
+        return list(dict.fromkeys([*sources, *(split_sweep(target)[0] for target in targets)]))
 
     def with_ct(self) -> list[str]:
         """Everybody with a CT of their own, in the manifest's order."""
@@ -142,11 +159,19 @@ class Dataset(ABC):
         """What a virtual sweep sees of one person (sec. II-C.2).
 
         Args:
-            name: one of `names`.
+            name: a patient of `pairs`.
             anatomy: that person's, where it is at hand.
             errors: what goes wrong; every source at its default size when None.
+
+        Raises:
+            StudyError: an unknown name, or a sweep that the cohort does not have.
         """
-        return make_patient(anatomy or self.anatomy(name), self.params, self.seed, errors)
+        person, sweep = split_sweep(name)
+        self.require(person)
+        n_sweeps = self.manifest.cohort(self.name).sweeps
+        if not 0 <= sweep < n_sweeps:
+            raise StudyError(f"{self.name}: expected one of {n_sweeps} sweep(s), numbered from 0, got {name!r}")
+        return make_patient(anatomy or self.anatomy(person), self.params, self.seed, errors, sweep)
 
     @abstractmethod
     def truth(self, source: str | Anatomy, target: str | Anatomy) -> TruthMap | None:
@@ -168,9 +193,10 @@ class Dataset(ABC):
             patient.cloud,
             source.waypoints.points,
             patient.labelled,
-            names=(source.name, patient.anatomy.name),
+            names=(source.name, patient.name),
             chests=chests,
         )
+        pair = replace(pair, shift_mm=patient.shift_mm)
         truth = self.truth(source, patient.anatomy)
         if truth is None:
             return pair

@@ -15,11 +15,13 @@ from study.errors import StudyError
 from study.evaluation.waypoints import intercostal_waypoints
 from study.files.landmarks import read_landmarks
 from study.files.volumes import read_labels, read_volume
+from study.naming import sweep_name
 from study.params import StudyParams
 from study.phantom.deformation import Deformation
 from study.seeds import named_rng
-from study.types import Mesh, PointCloud, RigidTransform, Volume, Waypoints
+from study.types import Floats, Mesh, PointCloud, RigidTransform, Volume, Waypoints
 from study.ultrasound.cloud import SweepReport, sweep_cloud
+from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.sweep_errors import SweepErrors
 from study.ultrasound.tracked import TrackedSweep
 from study.ultrasound.virtual_sweep import simulate_sweep
@@ -64,6 +66,8 @@ class Patient:
         labelled: the same cloud with the parts of the nearest true surface, as the paper's manual segmentation.
         T_us_ras: RAS+ to the tracker's base frame.
         report: frames used and dropped.
+        shift_mm: (3,) mm, base frame, the constant part of the sweep's errors; see `constant_shift_mm`.
+        sweep: its number among the sweeps of this anatomy.
     """
 
     anatomy: Anatomy
@@ -71,6 +75,13 @@ class Patient:
     labelled: PointCloud
     T_us_ras: RigidTransform
     report: SweepReport
+    shift_mm: Floats
+    sweep: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of the patient in this sweep, see `study.naming.sweep_name`."""
+        return sweep_name(self.anatomy.name, self.sweep)
 
 
 def anatomy_of(name: str, image: Volume, mask: Volume, n_points: int, rng: np.random.Generator) -> Anatomy:
@@ -116,7 +127,9 @@ def read_anatomy(
     return anatomy_of(image.name, image, mask, n_points, rng)
 
 
-def make_patient(anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: SweepErrors | None = None) -> Patient:
+def make_patient(
+    anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: SweepErrors | None = None, sweep: int = 0
+) -> Patient:
     """Sweep an anatomy with a virtual tracked probe whose base frame is anywhere (sec. II-C.2).
 
     Args:
@@ -124,13 +137,16 @@ def make_patient(anatomy: Anatomy, params: StudyParams, seed: int = 0, errors: S
         params: density of the cloud.
         seed: of the hand, the errors and the base frame.
         errors: what goes wrong; every source at its default size when None.
+        sweep: its number; another one has a hand, errors and a base frame of its own.
     """
-    T_us_ras = RigidTransform.random(named_rng(seed, f"{anatomy.name}/base"))
-    sweep = sweep_over(anatomy, T_us_ras, named_rng(seed, f"{anatomy.name}/sweep"), errors)
-    seen = sweep_cloud(sweep, spacing_mm=params.us_spacing_mm)
+    errors = SweepErrors() if errors is None else errors
+    name = sweep_name(anatomy.name, sweep)
+    T_us_ras = RigidTransform.random(named_rng(seed, f"{name}/base"))
+    tracked = sweep_over(anatomy, T_us_ras, named_rng(seed, f"{name}/sweep"), errors)
+    seen = sweep_cloud(tracked, spacing_mm=params.us_spacing_mm)
     cloud = replace(seen.cloud, front=seen.front)
     labelled = replace(cloud, parts=true_parts(T_us_ras.inverse.apply(cloud.points), anatomy.mesh))
-    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report)
+    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report, constant_shift_mm(tracked, errors), sweep)
 
 
 def sweep_over(

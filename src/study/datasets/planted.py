@@ -1,4 +1,4 @@
-"""A real CT, registered to itself under smooth deformations that are known."""
+"""Real CTs, each registered to itself under smooth deformations that are known."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from study.datasets.cut import Cut, cut_of
 from study.datasets.dataset import Dataset, TruthMap
 from study.datasets.people import Anatomy, anatomy_of
 from study.errors import StudyError
+from study.naming import PLANTED, person_of, planted_name
 from study.phantom.planted import planted_deformation
 from study.seeds import named_rng
 
@@ -72,9 +73,36 @@ class PlantedDataset(Dataset):
         return files_of(self.manifest, self.manifest.cohort(COHORT).subjects[self.origin(name) or name])
 
 
+@dataclass(frozen=True)
+class PlantedEveryDataset(PlantedDataset):
+    """Several real CTs; the patients of each are that person under deformations of its own, ``lung1+planted3``."""
+
+    def require(self, name: str) -> None:
+        """See `Dataset.require`; a planted patient is known by its person and its deformation."""
+        super().require(person_of(name))
+        known = [planted_name(person_of(name), deformation) for deformation in SIZES_MM]
+        if name not in (person_of(name), *known):
+            raise StudyError(f"{self.name}: expected a patient among {', '.join(known)}, got {name!r}")
+
+    def origin(self, name: str) -> str | None:
+        """See `Dataset.origin`."""
+        self.require(name)
+        return None if name == person_of(name) else person_of(name)
+
+    def targets(self) -> list[str]:
+        """See `Dataset.targets`: every deformation of every person."""
+        names = [planted_name(person, deformation) for person in self.sources() for deformation in SIZES_MM]
+        return names[: self.params.max_targets or None]
+
+    def atlases(self, target: str) -> list[str]:
+        """See `Dataset.atlases`: the CT that the patient is a deformation of."""
+        return [person_of(target)]
+
+
 def plant(source: Anatomy, name: str) -> Anatomy:
     """The patient ``name``: an anatomy under its known smooth deformation; it has no image of its own."""
-    deform = planted_deformation(source.mesh.vertices, SIZES_MM[name], named_rng(0, f"planted/{name}"))
+    size_mm = SIZES_MM[name.rpartition(PLANTED)[2]]
+    deform = planted_deformation(source.mesh.vertices, size_mm, named_rng(0, f"planted/{name}"))
     mesh = replace(source.mesh, vertices=deform.apply(source.mesh.vertices), name=name)
     cloud = replace(source.cloud, points=deform.apply(source.cloud.points), name=f"ct:{name}")
     waypoints = replace(source.waypoints, points=deform.apply(source.waypoints.points))

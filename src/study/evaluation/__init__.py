@@ -12,8 +12,19 @@ from study.evaluation.ablation import (
     options,
 )
 from study.evaluation.budget import Budget, Scanned, error_budget
-from study.evaluation.claims import CLAIMS, GRAPH, claims_table, differences
-from study.evaluation.comparisons import paired_tests, protocol_and_truth
+from study.evaluation.claim_questions import GRAPH
+from study.evaluation.claims import CLAIMS, claims_table, differences, with_minutes
+from study.evaluation.comparisons import protocol_and_truth
+from study.evaluation.controls import (
+    STEPS,
+    TRUE_ERRORS,
+    DecidingPoint,
+    agreement_summary,
+    deciding_point,
+    rank_agreement,
+    truth_floor,
+    truth_free_measures,
+)
 from study.evaluation.distances import (
     CloudDistances,
     directed_distances_mm,
@@ -22,11 +33,12 @@ from study.evaluation.distances import (
     sampling_floor_mm,
     waypoint_errors_mm,
 )
+from study.evaluation.intervals import Interval, difference_intervals, mean_intervals, over_people, paired_intervals
 from study.evaluation.judgement import Judgement
 from study.evaluation.metrics import METRICS, Metric, Unit, judge
 from study.evaluation.pair import TRUTH, Pair, align_pair, in_order, perfect
 from study.evaluation.poses import PoseCheck, PoseTrial, check_pose, random_pose, try_poses
-from study.evaluation.statistics import PairedTest, paired_wilcoxon, population_sd
+from study.evaluation.statistics import population_sd
 from study.evaluation.waypoints import intercostal_waypoints
 
 __all__ = [
@@ -36,25 +48,31 @@ __all__ = [
     "METRICS",
     "PROTOCOL",
     "RIGID",
+    "STEPS",
+    "TRUE_ERRORS",
     "TRUE_IN_PLANE",
     "TRUTH",
     "Budget",
     "CloudDistances",
+    "DecidingPoint",
+    "Interval",
     "Judgement",
     "Metric",
     "Option",
     "Pair",
-    "PairedTest",
     "PoseCheck",
     "PoseTrial",
     "Scanned",
     "Unit",
     "ablate",
+    "agreement_summary",
     "align_pair",
     "beyond_luck",
     "changes",
     "check_pose",
     "claims_table",
+    "deciding_point",
+    "difference_intervals",
     "differences",
     "directed_distances_mm",
     "error_budget",
@@ -62,15 +80,20 @@ __all__ = [
     "in_order",
     "intercostal_waypoints",
     "judge",
+    "mean_intervals",
     "options",
-    "paired_tests",
-    "paired_wilcoxon",
+    "over_people",
+    "paired_intervals",
     "perfect",
     "point_errors_mm",
     "population_sd",
     "protocol_and_truth",
     "random_pose",
+    "rank_agreement",
     "sampling_floor_mm",
+    "truth_floor",
+    "truth_free_measures",
     "try_poses",
     "waypoint_errors_mm",
+    "with_minutes",
 ]

@@ -11,6 +11,7 @@ from study.figures import (
     canvas,
     clouds,
     comparisons,
+    controls,
     distributions,
     evidence,
     graphs,
@@ -23,6 +24,7 @@ from study.figures.anatomy import *
 from study.figures.canvas import *
 from study.figures.clouds import *
 from study.figures.comparisons import *
+from study.figures.controls import *
 from study.figures.distributions import *
 from study.figures.evidence import *
 from study.figures.graphs import *
@@ -36,6 +38,7 @@ __all__ = [
     *canvas.__all__,
     *clouds.__all__,
     *comparisons.__all__,
+    *controls.__all__,
     *distributions.__all__,
     *evidence.__all__,
     *graphs.__all__,

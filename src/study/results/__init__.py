@@ -4,6 +4,7 @@ from study.results.compare import Comparison, compare
 from study.results.metrics_csv import CASE, FAILED, read_metrics
 from study.results.run import REFERENCE, Run, against_reference, find_runs, keep_pictures, newest, run_folder
 from study.results.tables import beside_paper, hd_table, paper_hd_table, paper_waypoints, waypoint_summary
+from study.results.verdicts import claim_rows, claims_markdown, write_claims
 
 __all__ = [
     "CASE",
@@ -13,6 +14,8 @@ __all__ = [
     "Run",
     "against_reference",
     "beside_paper",
+    "claim_rows",
+    "claims_markdown",
     "compare",
     "find_runs",
     "hd_table",
@@ -23,4 +26,5 @@ __all__ = [
     "read_metrics",
     "run_folder",
     "waypoint_summary",
+    "write_claims",
 ]

@@ -18,6 +18,7 @@ from study.evaluation.metrics import METRICS
 from study.evaluation.pair import TRUTH, in_order
 from study.files.atomic import json_text, sha256_of, write_bytes, write_json, write_text
 from study.files.places import CHECKOUT
+from study.naming import split_sweep
 from study.results.claim import PROVENANCE, Claim, claimed
 from study.results.compare import Comparison, compare
 from study.results.metrics_csv import (
@@ -168,7 +169,7 @@ class Run:
             "finished": self.provenance["finished"],
             "seconds": round(self.provenance["seconds"]),
             "CTs": self.metrics["source"].nunique(),
-            "patients": self.metrics["target"].nunique(),
+            "patients": self.metrics["target"].map(lambda name: split_sweep(name)[0]).nunique(),
             "pairs": self.n_pairs,
             "methods": ", ".join(self.methods),
             "cases": len(cases),

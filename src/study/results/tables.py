@@ -13,21 +13,29 @@ from study.evaluation.pair import TRUTH, in_order
 from study.evaluation.statistics import population_sd
 from study.files.atomic import write_text
 from study.files.places import shipped
-from study.naming import natural_key
+from study.naming import natural_key, split_sweep
 from study.results.metrics_csv import CASE, KEY, NOT_CONVERGED
+
+MOST_TABLES = 6  # of one patient each
 
 
 def write_tables(metrics: pd.DataFrame, out: Path) -> None:
     """Write into a new folder the Hausdorff tables in the shape of the paper's Table I: one a patient, columns the CTs.
 
-    One CT with several patients (the planted deformations) is turned: columns are the patients.
+    One CT with several patients (the planted deformations) is turned: columns are the patients. Sweeps of a patient are
+    averaged. More patients than tables of that shape can show share one, in which a CT is averaged over its patients.
     """
+    metrics = metrics.assign(target=[split_sweep(target)[0] for target in metrics["target"]])
     targets = sorted(metrics["target"].unique())
     dataset = metrics["dataset"].iloc[0]
     if metrics["source"].nunique() == 1:
         turned = metrics.assign(source=metrics["target"])
         caption = f"Hausdorff distance, {dataset}: {metrics['source'].iloc[0]} to each simulated patient"
         write_hd_table(turned, out / "hd_table", caption=caption)
+        return
+    if len(targets) > MOST_TABLES:
+        caption = f"Hausdorff distance, {dataset}: each CT, mean over its simulated patients"
+        write_hd_table(metrics, out / "hd_table", caption=caption)
         return
     for target in targets:
         stem = out / ("hd_table" if len(targets) == 1 else f"hd_table_{target}")
