@@ -117,8 +117,8 @@ def robustness_summary(rows: pd.DataFrame) -> pd.DataFrame:
     Returns:
         by ``kind``, ``level``, ``method`` and ``metric``: ``title`` and ``unit`` of the kind, ``draws``, ``median``,
         ``p5`` and ``p95`` over draws, ``low`` and ``high`` (95 % bootstrap interval of the median), and how many draws
-        ``warned``, were started ``by_hand`` or ``failed``; mm, NaN where all draws failed. A draw started by hand counts
-        in the median, a failed one cannot.
+        ``warned``, were started ``by_hand`` or ``failed``; mm, NaN where all draws failed. A draw started by hand
+        counts in the median, a failed one cannot.
     """
     keys = ["kind", "level", "method", "metric"]
     found = []
