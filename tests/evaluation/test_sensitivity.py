@@ -1,9 +1,12 @@
 """Every choice of the graph and around it, paired over people and seeds, with what cannot be judged counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
+from study.alignment.sternum import SternumParams
 from study.evaluation.ablation import options
 from study.evaluation.disturbances import Disturbance
 from study.evaluation.sensitivity import MEASURES, sensitivity_rows, sensitivity_summary, settings
@@ -15,7 +18,6 @@ SHORT = SomParams(epochs=20, samples=50)
 QUICK = SkeletonGraphMethod(SHORT, SHORT)
 SMALL = Disturbance(ct_points=2500, us_points=2500)
 CHOICES = ("random draws", "N of the blend (paper silent)", "parts of a cartilage (waypoints)")
-CHOICES = (*CHOICES, "rectangle of the sternum (coarse)")
 
 
 def test_choices_are_those_of_the_graph_and_those_around_it():
@@ -35,7 +37,8 @@ def test_choices_are_those_of_the_graph_and_those_around_it():
 @pytest.fixture(scope="module")
 def rows():
     listed = [one for one in settings(QUICK) if one.choice in CHOICES]
-    return pd.DataFrame(sensitivity_rows(523, listed, (0, 1), SMALL))
+    strict = replace(listed[-1], option="all covered", sternum=SternumParams(min_overlap=1.1))
+    return pd.DataFrame(sensitivity_rows(523, [*listed, strict], (0, 1), SMALL))
 
 
 def value(rows, option, metric, seed=0):
@@ -55,11 +58,11 @@ def test_options_behind_the_maps_share_them_and_other_seeds_do_not(rows):
 
 
 def test_a_coarse_alignment_that_refuses_is_rows_with_its_reason(rows):
-    strict = rows[rows["option"] == "0.8 covered"]
-    if strict["value"].isna().any():
-        assert strict["value"].isna().all()
-        assert strict["reason"].str.contains("expected|sternum").all()
-    assert rows.loc[rows["value"].isna(), "option"].isin(["0.8 covered", "25 × 90 mm"]).all()
+    strict = rows["option"] == "all covered"
+    assert strict.sum() == 2 * len(MEASURES)
+    assert rows["value"].isna().tolist() == strict.tolist()
+    assert rows.loc[strict, "reason"].str.contains("no sternum found").all()
+    assert (rows.loc[~strict, "reason"] == "").all()
 
 
 def planted(role, option, values):

@@ -87,7 +87,8 @@ def robustness(summary: pd.DataFrame, metric: str = "true_waypoint_error") -> Fi
     handles += [
         Patch(color=_BAND_COLOUR, label=f"5th-95th percentile of {draws} draws"),
         Line2D([], [], color=DARK, lw=2.5, label="95 % interval of the median"),
-        Line2D([], [], ls="", marker="$n$", color=DARK, label="refused: draws started by hand"),
+        Line2D([], [], ls="", label="n refused: draws that were started by hand"),
+        Line2D([], [], ls="", label="×n: draws of a method that failed"),
     ]
     below(figure, handles, 4)
     return figure
@@ -102,7 +103,7 @@ def _draw_kind(ax: Axes, rows: pd.DataFrame, methods: list[str], top: float) -> 
     for k, method in enumerate(methods):
         mine = rows[rows["method"] == method].set_index("level").reindex(levels)
         style = method_style(method)
-        x = np.arange(len(levels)) + 0.5 * ((k + 0.5) / len(methods) - 0.5)
+        x = np.arange(len(levels)) + 0.1 * len(levels) * ((k + 0.5) / len(methods) - 0.5)
         ax.fill_between(x, mine["p5"], mine["p95"], color=style.colour, alpha=0.1, lw=0)
         ax.vlines(x, mine["low"], mine["high"], color=style.colour, lw=2.5, alpha=0.8)
         ax.plot(
