@@ -159,17 +159,19 @@ def run_evidence(
 
 
 def _robustness(plan: EvidencePlan) -> _Part:
-    # A level that two kinds share, as what is not disturbed, is run once; one pair after the other, so that a run
-    # that is stopped has whole pairs.
-    named = {json_text(asdict(level.disturbance)): level.disturbance for level in plan.levels()}
+    # A level that several kinds share, as what is not disturbed, is run once, under the first one's name; one pair
+    # after the other, so that a run that is stopped has whole pairs.
+    names: dict[Disturbance, str] = {}
+    for level in plan.levels():
+        names.setdefault(level.disturbance, f"{level.kind} {level.value:g}")
     calls = {
-        f"{people}/{text}": (robustness_rows, disturbance, people, plan.methods)
+        f"{people} {name}": (robustness_rows, disturbance, people, plan.methods)
         for people in plan.people
-        for text, disturbance in named.items()
+        for disturbance, name in names.items()
     }
 
     def lost(key: str, error: StudyError) -> Rows:
-        people = int(key.partition("/")[0])
+        people = int(key.split()[0])
         return [row for method in plan.methods for row in failed_rows(people, method, error)]
 
     def tables(rows: dict[str, Rows]) -> tuple[dict[str, pd.DataFrame], dict[str, bytes]]:
@@ -178,7 +180,7 @@ def _robustness(plan: EvidencePlan) -> _Part:
                 {"kind": level.kind, "level": level.value, **row}
                 for level in plan.levels()
                 for people in plan.people
-                for row in rows[f"{people}/{json_text(asdict(level.disturbance))}"]
+                for row in rows[f"{people} {names[level.disturbance]}"]
             ]
         )
         draws = found[["kind", "level", "draw", "method", "metric", "value", "status"]]
@@ -242,7 +244,7 @@ def _run_part(part: _Part, folder: Path, workers: Workers) -> Path:
             write_text(new / f"{name}.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.4f"))
         for name, picture in pictures.items():
             write_bytes(new / f"{name}.png", picture)
-        seconds = [f"{json.dumps(key)},{outcome.seconds:.3f}\n" for key, outcome in outcomes.items()]
+        seconds = [f"{key},{outcome.seconds:.3f}\n" for key, outcome in outcomes.items()]  # no key holds a comma
         write_text(new / "timings.csv", "case,seconds\n" + "".join(seconds))
         record = provenance(part.name, part.parameters, 0, {}, started, datetime.now(UTC))
         record["code_sha256"] = basis["code_sha256"]  # that was run, whatever was edited since
