@@ -116,9 +116,7 @@ def test_ones_own_scans_never_have_a_known_truth_whatever_their_name(tmp_path: P
 
 
 def test_a_generated_cohort_that_nothing_makes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        StudyError, match=r"among phantom, planted, population, planted_every, got 'robots'"
-    ):
+    with pytest.raises(StudyError, match=r"among phantom, planted, population, planted_every, got 'robots'"):
         find_dataset("robots", manifest=manifest_of(tmp_path, {"a": {}, "b": {}}, cohort="robots"))
 
 
