@@ -8,6 +8,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 JOBS ?= 2
 RUNS := results/runs
+EVIDENCE := results/evidence
 export PYTHONHASHSEED := 0
 # One arithmetic thread a process: sums then have one order, and two workers do not fight over two cores.
 export OMP_NUM_THREADS := 1
@@ -15,7 +16,7 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export NUMEXPR_NUM_THREADS := 1
 
-.PHONY: help setup study test check notebooks reference bench lock clean
+.PHONY: help setup study evidence test check notebooks reference bench lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -31,6 +32,9 @@ study: $(STAMP)  ## run the whole study; prints the tables and where the figures
 	  $(BIN)/study run --dataset $$dataset --jobs $(JOBS) || exit 1; done
 	$(BIN)/python tools/notebooks.py run --jobs $(JOBS) --out $(RUNS)/notebooks
 	$(BIN)/study report $(RUNS)
+
+evidence: $(STAMP)  ## robustness, sensitivity, more people: up to 90 minutes on 2 cores, goes on where it was stopped
+	$(BIN)/study evidence --out $(EVIDENCE) --jobs $(JOBS)
 
 test: $(STAMP)  ## every test, and the notebooks on the quick profile
 	$(BIN)/pytest -n $(JOBS) --dist worksteal

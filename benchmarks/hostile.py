@@ -148,10 +148,11 @@ class World:
 
 Maker = Callable[[World], Case]
 KINDS: dict[str, Maker] = {}
-# A mirror image is a chest; 3-6 are shaped like 2-5; a little rib, or 40 % more, is a longer cartilage.
+# A mirror image is a chest; 3-6 and some 1-4 have the sizes of 2-5; a little rib, or 40 % more, is a longer cartilage.
 UNDECIDABLE = {
     "mirrored",
     "levels 3-6",
+    "levels 1-4",
     "with 15 mm of ribs, CT",
     "with 15 mm of ribs, US",
     "another species: limbs 40 % longer",

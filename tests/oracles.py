@@ -121,9 +121,14 @@ def check_contract(method: Method, *, identity_mm: float, pose_mm: float) -> Non
     assert bare.warped.tobytes() == first.warped.tobytes()
 
 
-def check_tuned(method: Method) -> None:
-    """The tuned parameters are the best row of the recorded grid, no row of which failed on a case unseen."""
-    table = pd.read_csv(Path(__file__).parents[1] / "results" / "tuning" / f"{method.name}.csv")
+def check_tuned(method: Method, surface: str = "") -> None:
+    """The tuned parameters are the best row of the recorded grid, no row of which failed on a case unseen.
+
+    Args:
+        method: the tuned one.
+        surface: how its table's name ends: ``""`` for the visible surface, ``"_whole"`` for the whole tube.
+    """
+    table = pd.read_csv(Path(__file__).parents[1] / "results" / "tuning" / f"{method.name}{surface}.csv")
     best = table.sort_values(["failed", "waypoint_error_mm"], kind="stable").iloc[0]
     assert len(table) > 10
     for name, value in asdict(method).items():  # type: ignore[call-overload]

@@ -32,16 +32,23 @@ def hops_literal(n: int, edges: Ints, *, directed: bool) -> Ints:
 
 
 def som_literal(graph: SkeletonGraph, points: Floats, params: SomParams, rng: np.random.Generator) -> Floats:
-    """Eq. 2, sample by sample and node by node, with the constant rate of the paper."""
-    assert params.rate_schedule == "constant"
+    """Eq. 2, sample by sample and node by node; what compounds overwrites itself, as in the authors' code."""
+    assert params.rate_schedule != "linear"
     nodes = [np.array(node) for node in graph.nodes]
     n = len(nodes)
     directed = hops_literal(n, graph.edges, directed=True)
     undirected = hops_literal(n, graph.edges, directed=False)
-    plan = [(directed, params.radius, params.pretrain_rate)] * params.pretrain_epochs
-    for epoch in range(params.epochs):
-        radius = int((params.radius - 1) * (1 - epoch / params.epochs)) + 1
-        plan.append((undirected, radius, params.rate))
+    plan, rate, radius = [], params.rate, int(params.radius)
+    for hops, epochs in ((directed, params.pretrain_epochs), (undirected, params.epochs)):
+        for epoch in range(epochs):
+            left = 1 - epoch / params.epochs
+            if params.radius_schedule == "compounding":
+                radius = int((radius - 1) * left) + 1
+            elif hops is undirected:
+                radius = int((params.radius - 1) * left) + 1
+            if params.rate_schedule == "compounding" and hops is undirected:
+                rate = rate * left
+            plan.append((hops, radius, params.pretrain_rate if hops is directed else rate))
     for hops, radius, rate in plan:
         for k in rng.integers(len(points), size=params.samples):
             winner = min(range(n), key=lambda s: float(((points[k] - nodes[s]) ** 2).sum()))

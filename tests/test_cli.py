@@ -27,6 +27,7 @@ from study import params as study_params
 from study import phantom
 from study.cli import main
 from study.ct.parts import parts_from_labels
+from study.datasets import for_evidence
 from study.files.atomic import sha256_of
 from study.files.clouds import read_ply, write_ply
 from study.methods import METHODS
@@ -86,7 +87,7 @@ def refused(capsys: Capture, *arguments: str | Path) -> str:
 
 @pytest.mark.parametrize(
     "words",
-    [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"], ["datasets"],
+    [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"], ["datasets"], ["evidence"],
      ["data", "list"], ["data", "fetch"], ["data", "verify"]],
     ids=" ".join,
 )  # fmt: skip
@@ -408,6 +409,8 @@ def test_only_the_whole_study_goes_where_the_reference_is_made_from(tmp_path: Pa
 def test_datasets_are_listed_by_the_library(capsys: Capture) -> None:
     assert main(["datasets", "--reported"]) == 0
     assert capsys.readouterr().out.splitlines() == ["phantom", "planted", "open"]
+    assert main(["datasets", "--evidence"]) == 0
+    assert capsys.readouterr().out.splitlines() == for_evidence()
     assert main(["datasets"]) == 0
     assert {"ribseg", "totalsegmentator"} < set(capsys.readouterr().out.splitlines())
 

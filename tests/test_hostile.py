@@ -35,7 +35,7 @@ def test_the_report_counts_what_is_wrong_in_silence_and_how_far() -> None:
     rows = [
         {"kind": "clean", "outcome": "right", "message": "", "mean_mm": 3.0},
         {"kind": "clean", "outcome": "right", "message": "bulge", "mean_mm": 3.0},
-        {"kind": "levels 1-4", "outcome": "wrong in silence", "message": "", "mean_mm": 30.0},
+        {"kind": "front given wrong way", "outcome": "wrong in silence", "message": "", "mean_mm": 30.0},
         {"kind": "mirrored", "outcome": "wrong in silence", "message": "", "mean_mm": 30.0},
     ]
     text = hostile.report(pd.DataFrame(rows))

@@ -4,10 +4,11 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import jupytext
 import nbformat
+import pandas as pd
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -185,3 +186,41 @@ def test_a_selection_that_matches_no_notebook_is_an_error(
     with pytest.raises(SystemExit, match="2"):
         notebooks.main(["write", "00", name])
     assert f"expected a notebook among 00_sum, or the start of one, got {name!r}" in capsys.readouterr().err
+
+
+# --- tune.py ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tune() -> ModuleType:
+    return load("tune")
+
+
+@pytest.mark.parametrize("name", ["icp", "nonrigid_icp", "cpd", "skeleton_graph"])
+def test_both_surfaces_are_tuned_on_one_grid_and_every_row_is_recorded(tune: ModuleType, name: str) -> None:
+    visible, whole = list(tune.grid(name)), list(tune.grid(name + tune.WHOLE))
+    assert whole[: len(visible)] == visible
+    assert not set(whole[len(visible) :]) & set(visible)
+    for table, rows in ((name, visible), (name + tune.WHOLE, whole)):
+        recorded = pd.read_csv(ROOT / "results" / "tuning" / f"{table}.csv")
+        assert sorted(recorded["setting"]) == list(range(len(rows)))
+
+
+def test_a_grid_runs_on_the_surface_that_its_table_is_named_after(
+    tune: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    surfaces = {}
+
+    def seen(_: object, runner: object, __: object) -> None:
+        surfaces[table] = "visible" if isinstance(runner, tune.VisibleSurface) else "whole"
+        raise tune.StudyError("enough")
+
+    monkeypatch.setattr(tune, "register_aligned", seen)
+    monkeypatch.setattr(tune, "development_pair", lambda name, _: SimpleNamespace(source=name, alignment=None))
+    monkeypatch.setattr(tune, "grid", lambda _: [tune.Icp()])
+    monkeypatch.setattr(tune, "summarise", lambda rows: rows)
+    for table in ("icp", "icp_whole", "cpd", "cpd_whole"):
+        monkeypatch.setattr(sys, "argv", ["tune.py", table, "--out", str(tmp_path)])
+        tune.main()
+        assert len(pd.read_csv(tmp_path / f"{table}.csv")) == len(tune.PAIRS)
+    assert surfaces == {"icp": "visible", "icp_whole": "whole", "cpd": "visible", "cpd_whole": "whole"}

@@ -95,13 +95,14 @@ def data_verify(dataset: str | None) -> None:
 
 @cli.command("datasets", short_help="Print the names of the data sets.")
 @click.option("--reported", is_flag=True, help="Only those that the study reports.")
-def list_datasets(reported: bool) -> None:
+@click.option("--evidence", is_flag=True, help="Only those that `make evidence` runs.")
+def list_datasets(reported: bool, evidence: bool) -> None:
     """Print the names of the data sets, one a line."""
     from study.data.manifest import load_manifest
-    from study.datasets import reported as those_reported
 
-    for name in those_reported() if reported else load_manifest().cohorts:
-        click.echo(name)
+    for name, cohort in load_manifest().cohorts.items():
+        if (cohort.reported or not reported) and (cohort.evidence or not evidence):
+            click.echo(name)
 
 
 @cli.command()
@@ -131,6 +132,21 @@ def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, o
     if out is None:
         out = run_folder(people.name, profile, seed, chosen, Path())
     _report(run_study(people, out, methods=chosen, n_jobs=jobs, show_progress=True))
+
+
+@cli.command(short_help="Gather what `make evidence` shows: robustness, sensitivity, more people.")
+@click.option("--profile", default="full", show_default=True, metavar="quick|full", help="How much, how finely.")
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1), help="Worker processes.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the folders of results.")
+def evidence(profile: str, jobs: int, out: Path) -> None:
+    """Run robustness, sensitivity and the data sets that the manifest calls evidence, each into a folder below OUT.
+
+    A run that was stopped goes on when the same command is given again; what is there and of now is not run again.
+    """
+    from study.batch.evidence import run_evidence
+
+    for folder in run_evidence(out, profile=profile, n_jobs=jobs, show_progress=True):
+        click.echo(folder)
 
 
 def _report(run: Run) -> None:

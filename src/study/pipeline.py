@@ -26,7 +26,7 @@ from study.seeds import named_rng
 from study.types import PointCloud, as_points
 from study.ultrasound.cloud import SweepCloud, thin_evenly
 
-MIN_SPACING_MM = 1.5  # of the points that a method sees; a cartilage is 10 mm wide
+MIN_SPACING_MM = 2.0  # of the points that a method sees; at 1.5 a side given 5 times still weighed more
 EVEN_SHARE = 0.7  # of the typical distance to the nearest neighbour: random scatter keeps most of its points
 CARRIERS = 8  # points a method saw, whose rigid motion carries a given one
 

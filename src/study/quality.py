@@ -51,7 +51,7 @@ QUALITY_LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType(
         "wrong_part_share": (0.1, "of the warped cartilages lie on another than their own: branches are swapped"),
         "further_motion_mm": (18.0, "mm is how far points moved after the coarse alignment: more than people differ"),
         "stretched_share": (0.4, "of neighbouring points are more than twice or less than half as far apart: torn"),
-        "folded_share": (0.3, "of the cloud is folded over as seen from the front"),
+        "folded_share": (0.35, "of the cloud is folded over as seen from the front"),
     }
 )
 SWAPPED = "wrong_part_share"

@@ -31,12 +31,16 @@ from study.datasets import (
     make_patient,
     read_anatomy,
     reported,
+    sweep_over,
 )
 from study.datasets.planted import SIZES_MM, plant
 from study.errors import StudyError
 from study.naming import person_of
 from study.params import PHANTOM_SEED, POPULATION_SEED, PROFILES, StudyParams
+from study.seeds import named_rng
 from study.types import PointCloud
+from study.ultrasound.constant_shift import constant_shift_mm
+from study.ultrasound.sweep_errors import SweepErrors
 
 
 def pairs(name: str, params: StudyParams, manifest: Manifest | None = None) -> list[tuple[str, str]]:
@@ -390,3 +394,11 @@ def test_a_patient_is_seen_from_the_front_in_a_frame_of_its_own(one: Anatomy) ->
     assert not np.allclose(other.T_us_ras.matrix, patient.T_us_ras.matrix)
     again = make_patient(one, SMALL)
     assert np.array_equal(again.cloud.points, patient.cloud.points)
+
+
+@pytest.mark.parametrize("errors", [None, SweepErrors.only("calibration"), SweepErrors.none()])
+def test_a_patient_knows_the_constant_part_of_its_sweeps_errors(one: Anatomy, errors: SweepErrors | None) -> None:
+    patient = make_patient(one, SMALL, errors=errors)
+    sweep = sweep_over(one, patient.T_us_ras, named_rng(0, f"{one.name}/sweep"), errors)
+    assert np.array_equal(patient.shift_mm, constant_shift_mm(sweep, errors or SweepErrors()))
+    assert (np.linalg.norm(patient.shift_mm) > 0.4) == (errors != SweepErrors.none())

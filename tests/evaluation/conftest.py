@@ -14,6 +14,12 @@ T_US_RAS = RigidTransform.random(np.random.default_rng(11))
 
 
 @pytest.fixture(scope="session")
+def T_us_ras() -> RigidTransform:
+    """RAS+ to the patient's tracker."""
+    return T_US_RAS
+
+
+@pytest.fixture(scope="session")
 def real_pair(ct_clouds: dict[str, PointCloud], us_cloud: PointCloud) -> Pair:
     """ct1 and the patient in a tracker's frame, as if they were two real people."""
     labelled = us_cloud.moved(T_US_RAS)
@@ -30,7 +36,8 @@ def pair(real_pair: Pair) -> Pair:
         T_US_RAS.apply(phantom.truth_map(*people, places))
         for places in (real_pair.alignment.source.cloud.points, real_pair.waypoints_ct)
     )
-    return replace(real_pair, true_points=points, true_waypoints=waypoints)
+    # The cloud has noise but no calibration: as the registered frame of a sweep with no constant error is.
+    return replace(real_pair, true_points=points, true_waypoints=waypoints, shift_mm=np.zeros(3))
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,8 @@ LISTED = {
     "learning rate (Eq. 2)": ["constant", "compounding", "linear to 0"],
     "epochs × samples (paper silent)": ["1000 × 500", "5000 × 500, US 3000 × 130", "200 × 500"],
     "start of the neighbourhood (paper silent)": ["5 hops", "2 hops", "3 hops"],
-    "one-way edges in the first epochs": ["3 epochs", "none"],
+    "fall of the neighbourhood (paper silent)": ["linear", "compounding radius"],
+    "one-way edges in the first epochs": ["3 epochs", "of the CT map only", "none"],
     "nodes that may win a point": ["any", "of the point's own part"],
     "nodes of a local transform (Eq. 3)": ["3 nodes", "within 3 hops", "16 nodes", RIGID],
     "weights of the blend (Eq. 4)": ["distance", "inverse distance"],
@@ -82,6 +83,8 @@ def test_options_of_the_authors_code_are_theirs():
     assert [option.option for option in options(PUBLISHED) if option.role == "authors"] == [
         "compounding",
         "5000 × 500, US 3000 × 130",
+        "compounding radius",
+        "of the CT map only",
         "within 3 hops",
         AS_AUTHORS,
     ]
@@ -89,10 +92,16 @@ def test_options_of_the_authors_code_are_theirs():
     assert longer.ct_som == replace(PUBLISHED.ct_som, epochs=5000, samples=500)
     assert longer.us_som == replace(PUBLISHED.us_som, epochs=3000, samples=130)
     everything = chosen(AS_AUTHORS).method
-    assert everything.ct_som == replace(longer.ct_som, rate_schedule="compounding")
-    assert everything.us_som == replace(longer.us_som, rate_schedule="compounding")
+    dying = {"rate_schedule": "compounding", "radius_schedule": "compounding"}
+    assert everything.ct_som == replace(longer.ct_som, **dying)
+    assert everything.us_som == replace(longer.us_som, **dying, pretrain_epochs=0)
     assert (everything.n_reg, everything.neighbours) == (3, "hops")
     assert replace(everything, ct_som=PUBLISHED.ct_som, us_som=PUBLISHED.us_som, neighbours="nodes") == PUBLISHED
+    one_by_one = [option.method for option in options(PUBLISHED) if option.role == "authors"][:-1]
+    for field in ("rate_schedule", "radius_schedule", "epochs", "samples", "pretrain_epochs"):
+        for som in ("ct_som", "us_som"):  # what they change together, they change one at a time
+            alone = {getattr(getattr(method, som), field) for method in one_by_one}
+            assert getattr(getattr(everything, som), field) in alone, (som, field)
 
 
 def test_options_follow_the_method_and_the_sphere_they_are_asked_for():

@@ -89,6 +89,10 @@ def test_inplane_errors_leave_out_the_normal_part():
     moved = reference + inside + normal
     assert waypoint_errors_mm(moved, reference, normal) == pytest.approx(np.full(20, 5.0))
     assert waypoint_errors_mm(moved, reference) == pytest.approx(np.full(20, np.sqrt(25 + 49)))
+    assert waypoint_errors_mm(moved, reference, normal, depth=True) == pytest.approx(np.full(20, 7.0))
+    assert waypoint_errors_mm(moved, reference, -normal, depth=True) == pytest.approx(np.full(20, 7.0))
+    with pytest.raises(StudyError, match="a plane normal to measure depth along, got none"):
+        waypoint_errors_mm(moved, reference, depth=True)
 
 
 @pytest.mark.parametrize(

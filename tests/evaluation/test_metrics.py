@@ -36,9 +36,22 @@ def test_every_metric_has_a_title_a_unit_and_a_measure_that_runs(name, pair, reg
 
 
 def test_judge_measures_what_the_plain_functions_do(pair, registration):
+    pair = replace(pair, shift_mm=np.array([0.4, -0.8, 1.2]))
     us = pair.alignment.target.cloud.points
     normal = pair.alignment.target.T_cloud_chest.rotation[:, 2]
-    moved = registration.transfer(pair.waypoints_ct, 20.0)
+    moved, visible_moved = (registration.transfer(at, 20.0) for at in (pair.waypoints_ct, pair.visible_waypoints_ct))
+    seen = CloudDistances.between(registration.warped[pair.visible], us)
+    paths = {
+        "waypoint_error": (moved, pair.waypoints_us),
+        "visible_waypoint_error": (visible_moved, pair.waypoints_us),
+        "true_waypoint_error": (moved, pair.true_waypoints),
+        "registered_waypoint_error": (moved, pair.true_waypoints + pair.shift_mm),
+    }
+    waypoints = {}
+    for name, path in paths.items():
+        waypoints[name] = waypoint_errors_mm(*path)
+        waypoints[f"{name}_inplane"] = waypoint_errors_mm(*path, normal)
+        waypoints[f"{name}_depth"] = waypoint_errors_mm(*path, normal, depth=True)
     surface = CloudDistances.between(registration.warped, us)
     points = point_errors_mm(registration.warped, pair.true_points)
     quality = measure_quality(pair.alignment, registration.warped)
@@ -46,10 +59,10 @@ def test_judge_measures_what_the_plain_functions_do(pair, registration):
         "hd": hausdorff_mm(registration.warped, us),
         "hd95": surface.hd95_mm,
         "msd": surface.mean_mm,
-        "waypoint_error": waypoint_errors_mm(moved, pair.waypoints_us),
-        "waypoint_error_inplane": waypoint_errors_mm(moved, pair.waypoints_us, normal),
-        "true_waypoint_error": waypoint_errors_mm(moved, pair.true_waypoints),
-        "true_waypoint_error_inplane": waypoint_errors_mm(moved, pair.true_waypoints, normal),
+        "visible_hd": seen.hausdorff_mm,
+        "visible_hd95": seen.hd95_mm,
+        "visible_msd": seen.mean_mm,
+        **waypoints,
         "true_error_mean": points.mean(),
         "true_error_p95": np.percentile(points, 95),
         "true_error_max": points.max(),
@@ -68,10 +81,28 @@ def test_judge_measures_what_the_plain_functions_do(pair, registration):
 
 def test_the_truth_is_judged_only_where_it_is_known(pair, real_pair, registration):
     known, unknown = judge(pair, registration), judge(real_pair, registration)
-    assert set(known) - set(unknown) == {name for name in METRICS if name.startswith("true_")}
-    assert all(METRICS[name].needs_truth == name.startswith("true_") for name in METRICS)
+    by_truth = ("true_", "registered_")
+    assert set(known) - set(unknown) == {name for name in METRICS if name.startswith(by_truth)}
+    assert all(METRICS[name].needs_truth == name.startswith(by_truth) for name in METRICS)
     for name, values in unknown.items():
         assert np.array_equal(values, known[name])
+
+
+def test_as_registered_is_judged_only_where_the_shift_is_known(pair, registration):
+    known, unknown = judge(pair, registration), judge(replace(pair, shift_mm=None), registration)
+    assert set(known) - set(unknown) == {name for name in METRICS if name.startswith("registered_")}
+    assert all(METRICS[name].needs_shift == name.startswith("registered_") for name in METRICS)
+
+
+def test_depth_and_plane_make_up_the_whole(pair, registration):
+    found = judge(pair, registration)
+    whole = [name for name in found if name.endswith("waypoint_error")]
+    assert len(whole) == 4
+    for name in whole:
+        inplane, depth = found[f"{name}_inplane"], found[f"{name}_depth"]
+        np.testing.assert_allclose(inplane**2 + depth**2, found[name] ** 2, rtol=1e-9)
+        assert depth.max() > 0.5
+        assert inplane.max() > 0.5
 
 
 def test_a_perfect_registration_has_no_error_by_the_truth_but_some_by_the_protocol(pair):
@@ -91,7 +122,7 @@ def test_the_clouds_are_searched_once_for_all_metrics(pair, registration, monkey
     monkeypatch.setattr(distances, "nearest", counted)
     judge(pair, registration)
     n, m = len(registration.warped), len(pair.alignment.target.cloud)
-    assert calls == {(n, m): 1, (m, n): 1}
+    assert calls == {(n, m): 1, (m, n): 1, (m, pair.visible.sum()): 1}
 
 
 def test_the_sphere_is_passed_on_and_a_waypoint_out_of_reach_is_refused(pair, registration):

@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +37,26 @@ def test_another_cloud_of_the_patient_changes_nothing_else(pair, us_cloud):
     assert other.alignment.target is chest
     assert other.alignment.source is pair.alignment.source
     assert replace(other, alignment=pair.alignment) == pair
+
+
+def test_a_ct_without_parts_of_its_own_is_cut_by_those_of_the_coarse_alignment(real_pair, ct_clouds):
+    chests = real_pair.alignment.source, real_pair.alignment.target
+    bare = replace(ct_clouds["ct1"], parts=None)
+    found = align_pair(bare, chests[1].cloud, real_pair.waypoints_ct, chests[1].cloud, names=("a", "b"), chests=chests)
+    assert found.parts_ct is None
+    assert np.array_equal(found.visible, real_pair.visible)
+    as_segmented = replace(found, parts_ct=chests[0].cloud.parts)
+    assert np.array_equal(found.visible_waypoints_ct, as_segmented.visible_waypoints_ct)
+    assert not np.array_equal(found.visible_waypoints_ct, real_pair.visible_waypoints_ct)
+
+
+def test_what_is_visible_is_found_once_and_goes_along_to_the_workers(real_pair, monkeypatch):
+    seen, waypoints = real_pair.visible, real_pair.visible_waypoints_ct
+    there = pickle.loads(pickle.dumps(real_pair))
+    monkeypatch.setattr(module, "faces_front", None)
+    monkeypatch.setattr(module, "intercostal_waypoints", None)
+    assert np.array_equal(there.visible, seen)
+    assert np.array_equal(there.visible_waypoints_ct, waypoints)
 
 
 def test_a_perfect_registration_is_the_truth_itself(pair):

@@ -6,6 +6,7 @@ import numpy as np
 from figure_data import METHODS, metrics, texts
 from matplotlib.colors import to_rgb
 
+import study
 from study import figures
 from study.evaluation import in_order
 from study.types import Part
@@ -22,11 +23,43 @@ def test_methods_keep_their_colour_and_tuned_ones_are_solid() -> None:
     assert len({figures.METHOD_STYLE[name].marker for name in METHODS}) == len(METHODS)
 
 
+def test_parameters_are_told_by_the_fill_and_the_surface_by_the_outline() -> None:
+    for name in (*METHODS, "bayesian_cpd"):
+        whole, visible, tuned, tuned_whole = (
+            figures.method_style(name + cell) for cell in ("", "_visible", "_tuned", "_tuned_whole")
+        )
+        assert {(one.colour, one.marker) for one in (whole, visible, tuned, tuned_whole)} == {
+            (whole.colour, whole.marker)
+        }
+        assert (whole.face, whole.hatch) == (visible.face, visible.hatch) != (tuned.face, tuned.hatch)
+        assert (tuned.face, tuned.hatch) == (tuned_whole.face, tuned_whole.hatch)
+        assert whole.edge == tuned_whole.edge == whole.colour
+        assert visible.edge == tuned.edge == "#000000"
+        assert len({one.label for one in (whole, visible, tuned, tuned_whole)}) == 4
+    assert figures.method_style("icp_tuned_whole").label == "ICP, tuned, whole"
+
+
+def test_every_method_of_the_study_is_listed_and_looks_different() -> None:
+    listed = {name: figures.METHOD_STYLE[name] for name in study.METHODS}
+    looks = {(style.colour, style.marker, style.face, style.hatch, style.edge) for style in listed.values()}
+    assert len(looks) == len({style.label for style in listed.values()}) == len(listed)
+
+
+def test_the_outline_is_drawn() -> None:
+    bars, boxes = (
+        draw(metrics(("icp_tuned", "icp_tuned_whole"))).axes[0].patches
+        for draw in (figures.hd_bars, figures.waypoint_boxes)
+    )
+    for patches in (bars, boxes):
+        edges = {tuple(patch.get_edgecolor()[:3]) for patch in patches}
+        assert {to_rgb("#000000"), to_rgb(figures.METHOD_STYLE["icp"].colour)} <= edges
+
+
 def test_a_new_method_needs_no_entry_here() -> None:
     style = figures.method_style("bayesian_cpd")
     assert style == figures.MethodStyle("bayesian cpd", "#33BBEE", "P", tuned=False)  # by its name, on every machine
     assert figures.method_style("bayesian_cpd_tuned") == figures.MethodStyle(
-        "bayesian cpd, tuned", style.colour, style.marker, tuned=True
+        "bayesian cpd, tuned", style.colour, style.marker, tuned=True, visible=True
     )
 
 

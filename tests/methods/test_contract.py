@@ -18,7 +18,13 @@ from study.types import PointCloud, RigidTransform
 
 # Mean mm that a cloud may move when registered to itself. Both maps jitter on their own draws: by some 3 mm at the
 # paper's constant rate, and three nodes nearly in a row turn that into more. All others come to rest where they began.
-IDENTITY_MM = {"skeleton_graph": 5.0, "skeleton_graph_tuned": 2.5}
+IDENTITY_MM = {
+    "skeleton_graph": 5.0,
+    "skeleton_graph_visible": 5.0,
+    "skeleton_graph_tuned": 2.5,
+    "skeleton_graph_tuned_whole": 2.5,
+    "skeleton_graph_authors": 2.5,
+}
 OTHER_IDENTITY_MM = 0.8
 
 
@@ -49,6 +55,16 @@ def test_the_promised_methods_are_there_and_cannot_be_changed():
     assert isinstance(METHODS, Mapping)
     with pytest.raises(TypeError):
         METHODS["icp"] = None
+
+
+@pytest.mark.parametrize("name", ["icp", "nonrigid_icp", "cpd", "skeleton_graph"])
+def test_a_method_has_a_row_for_each_of_its_parameters_on_each_surface(name):
+    shipped, kind = METHODS[name], type(METHODS[name])
+    assert METHODS[f"{name}_visible"] == VisibleSurface(shipped)
+    assert METHODS[f"{name}_tuned"] == VisibleSurface(kind.tuned())
+    assert METHODS[f"{name}_tuned_whole"] == kind.tuned_whole()
+    assert shipped == kind()
+    assert shipped not in (kind.tuned(), kind.tuned_whole())
 
 
 @pytest.mark.parametrize("name", list(METHODS))

@@ -97,5 +97,6 @@ def test_bad_parameters_are_refused(bad):
         Cpd(**bad)
 
 
-def test_the_tuned_setting_is_the_best_of_the_recorded_grid():
+def test_the_tuned_settings_are_the_best_of_the_recorded_grids():
     check_tuned(Cpd.tuned())
+    check_tuned(Cpd.tuned_whole(), "_whole")

@@ -86,5 +86,6 @@ def test_bad_parameters_are_refused_by_name(bad):
         Icp(**bad)
 
 
-def test_the_tuned_setting_is_the_best_of_the_recorded_grid():
+def test_the_tuned_settings_are_the_best_of_the_recorded_grids():
     check_tuned(Icp.tuned())
+    check_tuned(Icp.tuned_whole(), "_whole")

@@ -90,5 +90,6 @@ def test_bad_parameters_are_refused_by_name(bad):
         NonrigidIcp(**bad)
 
 
-def test_the_tuned_setting_is_the_best_of_the_recorded_grid():
+def test_the_tuned_settings_are_the_best_of_the_recorded_grids():
     check_tuned(NonrigidIcp.tuned())
+    check_tuned(NonrigidIcp.tuned_whole(), "_whole")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import check_tuned
 from oracles_som import blend_literal, local_transforms_literal
 
 from study.alignment.chest import align
@@ -29,6 +30,22 @@ def test_the_published_values_are_the_defaults():
     method = SkeletonGraphMethod()
     assert (method.n_reg, method.neighbours, method.blend_weights) == (3, "nodes", "distance")
     assert method.ct_som.rate == method.us_som.rate == 0.1
+
+
+def test_the_tuned_settings_are_the_best_of_the_recorded_grids():
+    check_tuned(SkeletonGraphMethod.tuned())
+    check_tuned(SkeletonGraphMethod.tuned_whole(), "_whole")
+
+
+def test_the_authors_choices_are_their_codes():
+    method = SkeletonGraphMethod.as_authors()
+    assert (method.n_reg, method.neighbours, method.blend_k, method.blend_weights) == (3, "hops", 3, "distance")
+    ct, us = method.ct_som, method.us_som
+    assert (ct.epochs, ct.samples, ct.pretrain_epochs, ct.pretrain_rate) == (5000, 500, 3, 0.02)
+    assert (us.epochs, us.samples, us.pretrain_epochs) == (3000, 130, 0)
+    for som in (ct, us):
+        assert (som.rate, som.rate_schedule) == (0.1, "compounding")
+        assert (som.radius, som.radius_schedule, som.winners) == (5, "compounding", "any")
 
 
 def test_it_is_template_map_map_eq_3_eq_4(pair):

@@ -21,10 +21,11 @@ def start(ct_clouds):
     return template_graph(chest_frame(ct_clouds["ct1"])), ct_clouds["ct1"]
 
 
-def test_the_fast_map_is_eq_2_as_written(start):
+@pytest.mark.parametrize("params", [SHORT, replace(SHORT, radius_schedule="compounding", rate_schedule="compounding")])
+def test_the_fast_map_is_eq_2_as_written(start, params):
     graph, cloud = start
-    fast, _ = fit_som(graph, cloud, SHORT, np.random.default_rng(7))
-    literal = som_literal(graph, cloud.points, SHORT, np.random.default_rng(7))
+    fast, _ = fit_som(graph, cloud, params, np.random.default_rng(7))
+    literal = som_literal(graph, cloud.points, params, np.random.default_rng(7))
     assert np.abs(literal - graph.nodes).max() > 1.0  # it went somewhere
     # Sums in another order: 1e-9 is a thousand roundings of coordinates of 100 mm.
     assert np.abs(fast.nodes - literal).max() < 1e-9
@@ -37,7 +38,7 @@ def test_the_defaults_are_the_papers():
     assert (params.rate, params.rate_schedule) == (0.1, "constant")
     assert (params.pretrain_epochs, params.pretrain_rate) == (3, 0.02)
     assert params.winners == "any"
-    assert params.radius == 5  # the authors' code; the paper has none
+    assert (params.radius, params.radius_schedule) == (5, "linear")  # theirs and ours; the paper has neither
 
 
 def test_the_authors_rate_compounds():
@@ -58,19 +59,44 @@ def test_rates_and_radii_are_functions_of_the_epoch():
         params = SomParams(epochs=50, rate_schedule=kind)
         backwards = [params.rate_at(epoch) for epoch in reversed(range(50))]
         assert backwards[::-1] == [params.rate_at(epoch) for epoch in range(50)]
+        assert params.rate_at(-1) == params.rate_at(-3) == params.pretrain_rate
     assert [SomParams(epochs=10).rate_at(epoch) for epoch in (0, 9)] == [0.1, 0.1]
+    for kind in ("linear", "compounding"):
+        params = SomParams(epochs=50, radius_schedule=kind)
+        backwards = [params.radius_at(epoch) for epoch in reversed(range(-3, 50))]
+        assert backwards[::-1] == [params.radius_at(epoch) for epoch in range(-3, 50)]
     linear = SomParams(epochs=10, rate_schedule="linear")
     assert [linear.rate_at(epoch) for epoch in (0, 5, 9)] == pytest.approx([0.1, 0.05, 0.01])
 
 
-def test_the_authors_radius_falls_from_5_to_4_after_one_epoch_and_ends_at_1():
+def test_our_radius_takes_the_whole_schedule_to_fall():
     params = SomParams(epochs=5000, radius=5.0)
     radii = [params.radius_at(epoch) for epoch in range(5000)]
-    assert radii[:2] == [5.0, 4.0]
-    assert radii[-1] == 1.0
-    assert set(radii) == {5.0, 4.0, 3.0, 2.0, 1.0}
+    assert [params.radius_at(epoch) for epoch in (-3, -2, -1)] == [5.0] * 3
     assert radii == sorted(radii, reverse=True)
-    assert radii == [int((5 - 1) * (1 - epoch / 5000)) + 1 for epoch in range(5000)]
+    # It is over 5 hops at epoch 0 only, since the rule cuts fractions off.
+    assert [radii.index(hops) for hops in (5.0, 4.0, 3.0, 2.0, 1.0)] == [0, 1, 1251, 2501, 3751]
+
+
+@pytest.mark.parametrize(
+    ("pretrain_epochs", "epochs", "first"),
+    [(3, 5000, [5, 4, 3, 3, 2, 1, 1]), (0, 3000, [5, 4, 3, 2, 1, 1])],  # their CT map, their US map
+)
+def test_the_authors_radius_is_at_1_hop_within_a_few_epochs(pretrain_epochs, epochs, first):
+    params = SomParams(epochs=epochs, pretrain_epochs=pretrain_epochs, radius_schedule="compounding")
+    radii = [params.radius_at(epoch) for epoch in range(-pretrain_epochs, epochs)]
+    assert radii[: len(first)] == first
+    assert set(radii[len(first) :]) == {1.0}
+
+
+@pytest.mark.parametrize(("pretrain_epochs", "epochs"), [(3, 5000), (0, 3000), (3, 10), (3, 4), (5, 2), (1, 1)])
+def test_the_authors_radius_is_their_loop(pretrain_epochs, epochs):
+    radius, radii = 5, []
+    for e in (*range(pretrain_epochs), *range(epochs)):
+        radius = min(radius, int((radius - 1) * (1 - e / epochs)) + 1)
+        radii.append(radius)
+    params = SomParams(epochs=epochs, pretrain_epochs=pretrain_epochs, radius_schedule="compounding")
+    assert [params.radius_at(epoch) for epoch in range(-pretrain_epochs, epochs)] == radii
 
 
 def test_the_neighbourhood_is_a_gaussian_of_hops_that_ends_at_the_radius():
@@ -162,6 +188,7 @@ def test_own_part_winners_never_leave_their_part(start):
         {"pretrain_rate": -0.1},
         {"radius": 0.5},
         {"rate_schedule": "falling"},
+        {"radius_schedule": "constant"},
         {"winners": "best"},
         {"rate": float("nan")},
     ],

@@ -116,7 +116,10 @@ def size_warnings(alignment: Alignment) -> tuple[str, ...]:
         StudyError: a chest with a size far outside its limits, or with three signs that it is none.
     """
     told: list[str] = []
-    source, target = chest_sizes(alignment.source), chest_sizes(alignment.target)
+    try:
+        source, target = chest_sizes(alignment.source), chest_sizes(alignment.target)
+    except StudyError as error:  # a part is missing, as in an alignment by hand: nothing to measure, and that is told
+        return (str(error),)
     for chest, sizes in ((alignment.source, source), (alignment.target, target)):
         told += _signs(chest.cloud.name, sizes)
     ratio = {name: float(np.log(target[name] / source[name])) for name in ("span", "reach", "width")}

@@ -198,7 +198,9 @@ def _chest(person: Anatomy | Patient) -> Chest:
 
 
 def _pair(dataset: Dataset, source: Anatomy, patient: Patient, ct: Chest, us: Chest) -> Pair:
-    return dataset.pair(source, patient, (ct, us))
+    pair = dataset.pair(source, patient, (ct, us))
+    _ = pair.visible_waypoints_ct  # kept on the pair: found here once, not by every method's worker
+    return pair
 
 
 def run_case(case: Case, pair: Pair, radius_mm: float) -> list[Row]:

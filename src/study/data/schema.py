@@ -228,6 +228,7 @@ class Cohort(_Strict):
     Attributes:
         kind: ``files`` (read from disk) or ``generated`` (made by the study itself).
         reported: whether the study reports it: what `make study` runs and the README's tables show.
+        evidence: whether `make evidence` runs it.
         people_of: the cohort whose people these are, so that draws named after a cohort are the same in both.
         sweeps: of each patient; the first is the one that a cohort with a single sweep has.
         atlases: CTs of each patient, by a cyclic design in which every person is a CT equally often; 0 for all.
@@ -236,6 +237,7 @@ class Cohort(_Strict):
     title: Text | None = None
     kind: Literal["files", "generated"] = "files"
     reported: bool = False
+    evidence: bool = False
     people_of: Key | None = None
     sweeps: Annotated[int, Field(gt=0)] = 1
     atlases: Annotated[int, Field(ge=0)] = 0

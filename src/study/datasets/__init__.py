@@ -32,6 +32,7 @@ __all__ = [
     "TruthMap",
     "anatomy_of",
     "find_dataset",
+    "for_evidence",
     "make_patient",
     "read_anatomy",
     "reported",
@@ -83,3 +84,8 @@ def find_dataset(
 def reported(manifest: Manifest | None = None) -> list[str]:
     """Names of the data sets that the study reports, in the manifest's order."""
     return [name for name, cohort in (manifest or load_manifest()).cohorts.items() if cohort.reported]
+
+
+def for_evidence(manifest: Manifest | None = None) -> list[str]:
+    """Names of the data sets that `make evidence` runs, in the manifest's order; there may be none."""
+    return [name for name, cohort in (manifest or load_manifest()).cohorts.items() if cohort.evidence]

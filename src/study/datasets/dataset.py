@@ -196,6 +196,7 @@ class Dataset(ABC):
             names=(source.name, patient.name),
             chests=chests,
         )
+        pair = replace(pair, shift_mm=patient.shift_mm)
         truth = self.truth(source, patient.anatomy)
         if truth is None:
             return pair

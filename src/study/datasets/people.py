@@ -19,8 +19,9 @@ from study.naming import sweep_name
 from study.params import StudyParams
 from study.phantom.deformation import Deformation
 from study.seeds import named_rng
-from study.types import Mesh, PointCloud, RigidTransform, Volume, Waypoints
+from study.types import Floats, Mesh, PointCloud, RigidTransform, Volume, Waypoints
 from study.ultrasound.cloud import SweepReport, sweep_cloud
+from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.sweep_errors import SweepErrors
 from study.ultrasound.tracked import TrackedSweep
 from study.ultrasound.virtual_sweep import simulate_sweep
@@ -65,6 +66,7 @@ class Patient:
         labelled: the same cloud with the parts of the nearest true surface, as the paper's manual segmentation.
         T_us_ras: RAS+ to the tracker's base frame.
         report: frames used and dropped.
+        shift_mm: (3,) mm, base frame, the constant part of the sweep's errors; see `constant_shift_mm`.
         sweep: its number among the sweeps of this anatomy.
     """
 
@@ -73,6 +75,7 @@ class Patient:
     labelled: PointCloud
     T_us_ras: RigidTransform
     report: SweepReport
+    shift_mm: Floats
     sweep: int = 0
 
     @property
@@ -136,13 +139,14 @@ def make_patient(
         errors: what goes wrong; every source at its default size when None.
         sweep: its number; another one has a hand, errors and a base frame of its own.
     """
+    errors = SweepErrors() if errors is None else errors
     name = sweep_name(anatomy.name, sweep)
     T_us_ras = RigidTransform.random(named_rng(seed, f"{name}/base"))
     tracked = sweep_over(anatomy, T_us_ras, named_rng(seed, f"{name}/sweep"), errors)
     seen = sweep_cloud(tracked, spacing_mm=params.us_spacing_mm)
     cloud = replace(seen.cloud, front=seen.front)
     labelled = replace(cloud, parts=true_parts(T_us_ras.inverse.apply(cloud.points), anatomy.mesh))
-    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report, sweep)
+    return Patient(anatomy, cloud, labelled, T_us_ras, seen.report, constant_shift_mm(tracked, errors), sweep)
 
 
 def sweep_over(

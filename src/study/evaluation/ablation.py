@@ -1,7 +1,7 @@
 """What each choice of the skeleton graph is worth: the published method with one thing changed at a time.
 
 `DEVIATIONS.md` has a row for each choice. Where the paper is silent, the published option is this study's, or the
-authors' code's for the neighbourhood.
+authors' code's for the start and the shape of the neighbourhood.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Literal
 
 import pandas as pd
@@ -29,10 +28,7 @@ from study.skeleton.template import N_NODES
 Role = Literal["paper", "authors", "alternative", "yardstick"]
 PROTOCOL, TRUE_IN_PLANE = "protocol", "truth, in the feature plane"  # who judges an option
 RIGID = "all nodes: rigid"
-AS_AUTHORS = "authors' schedule, rate and N_reg"
-AUTHORS_EPOCHS: Mapping[str, Mapping[str, int]] = MappingProxyType(
-    {"ct": {"epochs": 5000, "samples": 500}, "us": {"epochs": 3000, "samples": 130}}
-)
+AS_AUTHORS = "skeleton_graph_authors"
 FIRST_DRAW = "first"
 MORE_DRAWS = ("second", "third", "fourth")  # of the yardstick
 
@@ -89,7 +85,11 @@ def _maps(
 def _of_the_map(method: SkeletonGraphMethod, radius_mm: float) -> list[Option]:
     """Choices of the map (sec. III-B, Eq. 2), after the yardstick."""
     paper = partial(Option, role="paper", method=method, radius_mm=radius_mm)
-    som = method.ct_som
+    som, authors = method.ct_som, SkeletonGraphMethod.as_authors()
+    epochs = {
+        name: {"epochs": theirs.epochs, "samples": theirs.samples}
+        for name, theirs in (("ct", authors.ct_som), ("us", authors.us_som))
+    }
     return [
         *_choice(paper("random draws", "one seed"), ("other seeds", "yardstick", method)),
         *_choice(
@@ -99,7 +99,7 @@ def _of_the_map(method: SkeletonGraphMethod, radius_mm: float) -> list[Option]:
         ),
         *_choice(
             paper("epochs × samples (paper silent)", f"{som.epochs} × {som.samples}"),
-            ("5000 × 500, US 3000 × 130", "authors", _maps(method, **AUTHORS_EPOCHS)),
+            ("5000 × 500, US 3000 × 130", "authors", _maps(method, **epochs)),
             (f"{som.epochs // 5} × {som.samples}", "alternative", _maps(method, epochs=som.epochs // 5)),
         ),
         *_choice(
@@ -108,7 +108,12 @@ def _of_the_map(method: SkeletonGraphMethod, radius_mm: float) -> list[Option]:
             ("3 hops", "alternative", _maps(method, radius=3.0)),
         ),
         *_choice(
+            paper("fall of the neighbourhood (paper silent)", som.radius_schedule),
+            ("compounding radius", "authors", _maps(method, radius_schedule="compounding")),
+        ),
+        *_choice(
             paper("one-way edges in the first epochs", f"{som.pretrain_epochs} epochs"),
+            ("of the CT map only", "authors", _maps(method, us={"pretrain_epochs": 0})),
             ("none", "alternative", _maps(method, pretrain_epochs=0)),
         ),
         *_choice(
@@ -150,7 +155,6 @@ def _of_the_path(method: SkeletonGraphMethod, radius_mm: float) -> list[Option]:
 def _of_it_all(method: SkeletonGraphMethod, radius_mm: float) -> list[Option]:
     """Which surface is registered, and several choices at once."""
     paper = partial(Option, role="paper", method=method, radius_mm=radius_mm)
-    authors = replace(_maps(method, **AUTHORS_EPOCHS, rate_schedule="compounding"), n_reg=3, neighbours="hops")
     tuned = "skeleton_graph_tuned"
     return [
         *_choice(
@@ -159,7 +163,7 @@ def _of_it_all(method: SkeletonGraphMethod, radius_mm: float) -> list[Option]:
         ),
         *_choice(
             paper("all of it together", "as published"),
-            (AS_AUTHORS, "authors", authors),
+            (AS_AUTHORS, "authors", METHODS[AS_AUTHORS]),
             (tuned, "alternative", METHODS[tuned]),
         ),
     ]

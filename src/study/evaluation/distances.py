@@ -84,11 +84,19 @@ def sampling_floor_mm(points: Floats, n_points: int, rng: np.random.Generator, n
     return float(np.mean(floors))
 
 
-def point_errors_mm(points: Floats, reference: Floats, plane_normal: ArrayLike | None = None) -> Floats:
+def point_errors_mm(
+    points: Floats, reference: Floats, plane_normal: ArrayLike | None = None, *, depth: bool = False
+) -> Floats:
     """Distance (k,) mm of corresponding rows of (k, 3) mm; with ``plane_normal`` (3,) its part in that plane.
 
     Both clouds' antero-posterior error is half a cartilage where CT shows a tube and ultrasound its front, so the
     part in the feature plane is what a method can be judged by.
+
+    Args:
+        points: (k, 3) mm.
+        reference: (k, 3) mm, row i belongs to ``points[i]``.
+        plane_normal: (3,) of the plane, of any length.
+        depth: the part along ``plane_normal`` instead, without its sign.
 
     Raises:
         StudyError: rows that do not pair, values that are not finite, a normal without direction.
@@ -97,16 +105,22 @@ def point_errors_mm(points: Floats, reference: Floats, plane_normal: ArrayLike |
     if points.shape != reference.shape:
         raise StudyError(f"expected one reference per point, got {points.shape} and {reference.shape}")
     offsets = points - reference
+    if plane_normal is None and depth:
+        raise StudyError("expected a plane normal to measure depth along, got none; pass that of the feature plane")
     if plane_normal is not None:
         normal = np.asarray(plane_normal, dtype=np.float64)
         length = float(np.linalg.norm(normal))
         if normal.shape != (3,) or not np.isfinite(length) or length == 0:
             raise StudyError(f"expected a plane normal of shape (3,) and some length, got {normal!r}")
+        if depth:
+            return np.abs(offsets @ (normal / length))
         offsets = offsets - np.outer(offsets @ (normal / length), normal / length)
     lengths: Floats = np.linalg.norm(offsets, axis=1)
     return lengths
 
 
-def waypoint_errors_mm(transferred: Floats, reference: Floats, plane_normal: ArrayLike | None = None) -> Floats:
+def waypoint_errors_mm(
+    transferred: Floats, reference: Floats, plane_normal: ArrayLike | None = None, *, depth: bool = False
+) -> Floats:
     """Error (k,) mm of transferred waypoints against those defined on the target (sec. IV-B); see `point_errors_mm`."""
-    return point_errors_mm(transferred, reference, plane_normal)
+    return point_errors_mm(transferred, reference, plane_normal, depth=depth)

@@ -41,6 +41,7 @@ class Metric:
         reason: why that much and no more.
         measure: a value, or one a waypoint, of a judged registration.
         needs_truth: whether the pair's deformation must be known.
+        needs_shift: whether the constant shift of its sweep must be known, too.
     """
 
     title: str
@@ -50,6 +51,11 @@ class Metric:
     reason: str
     measure: Callable[[Judgement], ArrayLike]
     needs_truth: bool = False
+    needs_shift: bool = False
+
+    def measurable(self, pair: Pair) -> bool:
+        """Whether enough is known of a pair."""
+        return (pair.has_truth or not self.needs_truth) and (pair.shift_mm is not None or not self.needs_shift)
 
 
 # Means: the closest two methods that a claim tells apart are 0.012 mm apart (Hausdorff distance on the phantom). From
@@ -61,26 +67,55 @@ _SHARE = "a percentile ignores single points"
 _COUNT = "a share of thousands of points; a limit stands where right and wrong differ by more"
 _MM, _1 = Unit.MILLIMETRES, Unit.FRACTION
 
+
+def _waypoint_metrics(
+    name: str, title: str, errors_mm: Callable[[Judgement], Callable[..., Floats]], **needs: bool
+) -> dict[str, Metric]:
+    """A waypoint error in space, its part in the feature plane, which a path on the skin feels, and in depth."""
+    return {
+        name: Metric(title, _MM, 0.1, 0.01, _PLACE, lambda j: errors_mm(j)(), **needs),
+        f"{name}_inplane": Metric(
+            f"{title} in the feature plane", _MM, 0.1, 0.01, _PLACE, lambda j: errors_mm(j)(in_plane=True), **needs
+        ),
+        f"{name}_depth": Metric(
+            f"{title} in depth", _MM, 0.1, 0.01, _PLACE, lambda j: errors_mm(j)(in_depth=True), **needs
+        ),
+    }
+
+
 METRICS: Mapping[str, Metric] = MappingProxyType(
     {
         "hd": Metric("Hausdorff distance", _MM, 0.2, 0.01, _WORST, lambda j: j.surface.hausdorff_mm),
         "hd95": Metric("95th percentile Hausdorff distance", _MM, 0.1, 0.01, _SHARE, lambda j: j.surface.hd95_mm),
         "msd": Metric("Mean surface distance", _MM, 0.05, 0.005, _MEAN, lambda j: j.surface.mean_mm),
-        "waypoint_error": Metric("Waypoint error", _MM, 0.1, 0.01, _PLACE, lambda j: j.protocol_errors_mm()),
-        "waypoint_error_inplane": Metric(
-            "Waypoint error in the feature plane", _MM, 0.1, 0.01, _PLACE, lambda j: j.protocol_errors_mm(in_plane=True)
+        # The same, like with like: what a probe can see of the warped CT cloud (`Judgement.visible_surface`).
+        "visible_hd": Metric(
+            "Hausdorff distance of the visible part", _MM, 0.2, 0.01, _WORST, lambda j: j.visible_surface.hausdorff_mm
         ),
-        "true_waypoint_error": Metric(
-            "True waypoint error", _MM, 0.1, 0.01, _PLACE, lambda j: j.true_waypoint_errors_mm(), needs_truth=True
-        ),
-        "true_waypoint_error_inplane": Metric(
-            "True waypoint error in the feature plane",
+        "visible_hd95": Metric(
+            "95th percentile Hausdorff distance of the visible part",
             _MM,
             0.1,
             0.01,
-            _PLACE,
-            lambda j: j.true_waypoint_errors_mm(in_plane=True),
+            _SHARE,
+            lambda j: j.visible_surface.hd95_mm,
+        ),
+        "visible_msd": Metric(
+            "Mean surface distance of the visible part", _MM, 0.05, 0.005, _MEAN, lambda j: j.visible_surface.mean_mm
+        ),
+        **_waypoint_metrics("waypoint_error", "Waypoint error", lambda j: j.protocol_errors_mm),
+        **_waypoint_metrics(
+            "visible_waypoint_error", "Waypoint error of the visible part", lambda j: j.visible_protocol_errors_mm
+        ),
+        **_waypoint_metrics(
+            "true_waypoint_error", "True waypoint error", lambda j: j.true_waypoint_errors_mm, needs_truth=True
+        ),
+        **_waypoint_metrics(
+            "registered_waypoint_error",
+            "True waypoint error as registered",
+            lambda j: j.registered_waypoint_errors_mm,
             needs_truth=True,
+            needs_shift=True,
         ),
         "true_error_mean": Metric(
             "Mean true point error", _MM, 0.05, 0.005, _MEAN, lambda j: j.true_point_errors_mm.mean(), needs_truth=True
@@ -116,7 +151,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 
 
 def judge(pair: Pair, registration: Registration, radius_mm: float = 20.0) -> dict[str, Floats]:
-    """Every metric of one registration (sec. IV); those that need the truth only where it is known.
+    """Every metric of one registration (sec. IV); those that need the truth or the sweep's shift only where known.
 
     Args:
         pair: what was registered.
@@ -133,5 +168,5 @@ def judge(pair: Pair, registration: Registration, radius_mm: float = 20.0) -> di
     return {
         name: np.atleast_1d(np.asarray(metric.measure(judgement), dtype=np.float64))
         for name, metric in METRICS.items()
-        if pair.has_truth or not metric.needs_truth
+        if metric.measurable(pair)
     }

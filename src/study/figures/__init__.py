@@ -11,7 +11,9 @@ from study.figures import (
     canvas,
     clouds,
     comparisons,
+    controls,
     distributions,
+    evidence,
     graphs,
     registration,
     style,
@@ -22,7 +24,9 @@ from study.figures.anatomy import *
 from study.figures.canvas import *
 from study.figures.clouds import *
 from study.figures.comparisons import *
+from study.figures.controls import *
 from study.figures.distributions import *
+from study.figures.evidence import *
 from study.figures.graphs import *
 from study.figures.registration import *
 from study.figures.style import *
@@ -34,7 +38,9 @@ __all__ = [
     *canvas.__all__,
     *clouds.__all__,
     *comparisons.__all__,
+    *controls.__all__,
     *distributions.__all__,
+    *evidence.__all__,
     *graphs.__all__,
     *registration.__all__,
     *style.__all__,

@@ -199,6 +199,6 @@ def method_legend(figure: Figure, methods: Sequence[str], extra: Sequence[Any] =
     handles: list[Any] = []
     for method in methods:
         style = method_style(method)
-        handles.append(Patch(facecolor=style.face, edgecolor=style.colour, hatch=style.hatch, label=style.label))
+        handles.append(Patch(facecolor=style.face, edgecolor=style.edge, hatch=style.hatch, label=style.label))
     columns = min(len(handles) + len(extra), 5)
     below(figure, [*handles, *extra], columns)

@@ -17,7 +17,7 @@ from study.evaluation.pair import in_order
 from study.evaluation.statistics import population_sd
 from study.figures.canvas import below, new_figure, plain, require, require_columns
 from study.figures.rows import method_row, name_rows, spread, stripe_rows
-from study.figures.style import DARK, GREY, SIMULATED, method_style
+from study.figures.style import DARK, GREY, SIMULATED, MethodStyle, method_style
 from study.types import Floats
 
 __all__ = ["error_budget", "paired_differences", "sensitivity"]
@@ -146,11 +146,11 @@ def error_budget(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     errors, methods = list(dict.fromkeys(df["error"])), in_order(path["method"])
     figure = new_figure(1.5 + 0.46 * len(errors), f"What each error of the ultrasound costs ({note})")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=[1, 1.9])
-    _strip(left, errors, cloud, 0.0, DARK, "o", DARK)
+    _strip(left, errors, cloud, 0.0, MethodStyle("", DARK, "o", tuned=True))
     for k, method in enumerate(methods):
         style = method_style(method)
         aside = 0.62 * ((k + 0.5) / len(methods) - 0.5)
-        _strip(right, errors, path[path["method"] == method], aside, style.face, style.marker, style.colour)
+        _strip(right, errors, path[path["method"] == method], aside, style)
     for ax, title in ((left, "cloud to the true surface, mean (mm)"), (right, "mean waypoint error (mm)")):
         stripe_rows(ax, len(errors))
         ax.set_xlabel(title, fontsize=9)
@@ -159,22 +159,21 @@ def error_budget(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
         plain(ax)
     name_rows(left, errors)
     styles = [method_style(method) for method in methods]
-    marks = [Line2D([], [], ls="", marker=s.marker, mfc=s.face, mec=s.colour, label=s.label) for s in styles]
+    marks = [Line2D([], [], ls="", marker=s.marker, mfc=s.face, mec=s.edge, label=s.label) for s in styles]
     below(figure, marks, min(5, len(marks)))
     return figure
 
 
-def _strip(
-    ax: Axes, errors: Sequence[str], rows: pd.DataFrame, aside: float, face: Any, marker: str, edge: str
-) -> None:
+def _strip(ax: Axes, errors: Sequence[str], rows: pd.DataFrame, aside: float, style: MethodStyle) -> None:
     """The mean of each error's values as a marker, ``aside`` of its row, their range as a line."""
     for y, error in enumerate(errors):
         values = rows.loc[rows["error"] == error, "value"].dropna().to_numpy()
         if len(values) > 1:
-            ax.plot([values.min(), values.max()], [y + aside] * 2, color=edge, lw=1, alpha=0.6)
-            ax.scatter(values, np.full(len(values), y + aside), s=6, c=edge, lw=0, alpha=0.6)
+            ax.plot([values.min(), values.max()], [y + aside] * 2, color=style.colour, lw=1, alpha=0.6)
+            ax.scatter(values, np.full(len(values), y + aside), s=6, c=style.colour, lw=0, alpha=0.6)
         if len(values):
-            ax.scatter(values.mean(), y + aside, s=38, marker=marker, fc=face, ec=edge, lw=1.1, zorder=4)
+            look: dict[str, Any] = {"marker": style.marker, "fc": style.face, "ec": style.edge}
+            ax.scatter(values.mean(), y + aside, s=38, lw=1.1, zorder=4, **look)
 
 
 def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str = SIMULATED) -> Figure:

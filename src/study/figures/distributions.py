@@ -130,7 +130,7 @@ def _source_boxes(ax: Axes, places: Floats, cases: _Cases, source: str, *, count
 def _box(ax: Axes, x: float, values: Floats, method: str) -> None:
     style = method_style(method)
     drawn = ax.boxplot([values], positions=[x], widths=0.72, showfliers=False, patch_artist=True, manage_ticks=False)
-    drawn["boxes"][0].set(facecolor=style.face, edgecolor=style.colour, hatch=style.hatch, linewidth=1.1)
+    drawn["boxes"][0].set(facecolor=style.face, edgecolor=style.edge, hatch=style.hatch, linewidth=1.1)
     drawn["medians"][0].set(color="white" if max(style.face) < 0.3 else "black", linewidth=1.8)
     for line in (*drawn["whiskers"], *drawn["caps"]):
         line.set(color=style.colour, linewidth=1.1)
@@ -176,7 +176,7 @@ def hd_bars(
 
 def _bar_style(method: str) -> dict[str, Any]:
     style = method_style(method)
-    return {"width": 0.86, "fc": style.face, "ec": style.colour, "hatch": style.hatch, "lw": 1.0}
+    return {"width": 0.86, "fc": style.face, "ec": style.edge, "hatch": style.hatch, "lw": 1.0}
 
 
 def _source_bars(ax: Axes, places: Floats, cases: _Cases, method: str) -> list[float]:

@@ -152,7 +152,7 @@ def _draw_path(ax: Axes, goal: Floats, found: Floats, spaces: Sequence[Ints], me
     errors = list(np.stack([goal, found], 1)[:, :, :2])
     ax.add_collection(LineCollection(errors, colors=_ERROR_COLOUR, linewidths=1.2, zorder=6))
     ax.scatter(goal[:, 0], goal[:, 1], s=34, fc="white", ec=DARK, lw=1.2, zorder=4)
-    marker: dict[str, Any] = {"marker": style.marker, "fc": style.face, "ec": style.colour}
+    marker: dict[str, Any] = {"marker": style.marker, "fc": style.face, "ec": style.edge}
     ax.scatter(found[:, 0], found[:, 1], s=30, lw=1.2, zorder=5, **marker)
     error, flat = (np.linalg.norm((found - goal)[:, :n], axis=1) for n in (3, 2))
     return f"{style.label}: mean error {error.mean():.1f} mm, in this view {flat.mean():.1f} mm"

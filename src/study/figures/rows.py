@@ -31,7 +31,7 @@ def method_row(ax: Axes, y: float, values: Floats, method: str, **bar: Any) -> N
         return
     style = method_style(method)
     ax.scatter(values, np.full(len(values), y + 0.2), s=8, c=style.colour, alpha=0.6, lw=0)
-    bar |= {"mfc": style.face, "mec": style.colour, "ecolor": style.colour, "ms": 7, "capsize": 2.5}
+    bar |= {"mfc": style.face, "mec": style.edge, "ecolor": style.colour, "ms": 7, "capsize": 2.5}
     ax.errorbar(float(values.mean()), y - 0.08, xerr=population_sd(values), fmt=style.marker, **bar)
 
 

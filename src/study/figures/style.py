@@ -1,7 +1,7 @@
 """Colours, markers and labels: rib levels, clouds and methods look the same in every figure.
 
-Rib levels have one colour each, the patient's left lighter than the right; methods have one colour and marker each, as
-tuned solid and as shipped lighter and hatched.
+Rib levels have one colour each, the patient's left lighter than the right. Methods have one colour and marker each: as
+tuned solid, as shipped lighter and hatched; a dark outline where they see the visible surface only.
 """
 
 from __future__ import annotations
@@ -61,15 +61,22 @@ class MethodStyle:
 
     Attributes:
         label: for legends.
-        colour: of lines and edges.
+        colour: of lines and fills.
         marker: of points.
         tuned: tuned methods are solid, the others lighter and hatched.
+        visible: methods that register the visible surface only have a dark outline, the others one of their colour.
     """
 
     label: str
     colour: str
     marker: str
     tuned: bool
+    visible: bool = False
+
+    @property
+    def edge(self) -> str:
+        """Outline of bars, boxes and markers."""
+        return "#000000" if self.visible else self.colour
 
     @property
     def face(self) -> Colour:
@@ -82,11 +89,15 @@ class MethodStyle:
         return "" if self.tuned else "////"
 
 
+_CELLS = {"_tuned_whole": (True, False), "_tuned": (True, True), "_visible": (False, True)}  # tuned, visible
+
+
 def _styles(name: str, label: str, colour: str, marker: str) -> dict[str, MethodStyle]:
-    return {
-        name: MethodStyle(label, colour, marker, tuned=False),
-        f"{name}_tuned": MethodStyle(f"{label}, tuned", colour, marker, tuned=True),
-    }
+    """The four cells of a method: parameters, shipped or tuned, times surface, whole or visible."""
+    styles = {name: MethodStyle(label, colour, marker, tuned=False)}
+    for suffix, (tuned, visible) in _CELLS.items():
+        styles[name + suffix] = MethodStyle(label + suffix.replace("_", ", "), colour, marker, tuned, visible)
+    return styles
 
 
 # Paul Tol's vibrant scheme, safe for the colour-blind. A method that is not listed gets a style by its name.
@@ -96,6 +107,7 @@ METHOD_STYLE: Mapping[str, MethodStyle] = {
     **_styles("nonrigid_icp", "Non-rigid ICP", "#EE7733", "s"),
     **_styles("cpd", "CPD", "#009988", "^"),
     **_styles("skeleton_graph", "Skeleton graph", "#CC3311", "D"),
+    "skeleton_graph_authors": MethodStyle("Skeleton graph, authors' code", "#882255", "d", tuned=False),
     # No method: the known deformation, judged like one.
     TRUTH: MethodStyle("Perfect (truth)", "#222222", "*", tuned=True),
 }
@@ -109,11 +121,11 @@ def method_style(name: str) -> MethodStyle:
     """The style of any method; a new one needs no entry in `METHOD_STYLE`.
 
     A name that is not listed always gets the same colour and marker, which no listed method has, and is its own label;
-    with ``_tuned`` it is drawn solid.
+    endings such as ``_tuned`` are drawn as they are for the listed ones.
     """
     if name in METHOD_STYLE:
         return METHOD_STYLE[name]
-    base = name.removesuffix("_tuned")
+    base = name.removesuffix(next(filter(name.endswith, _CELLS), ""))
     pick = crc32(base.encode())
     colour, marker = _OTHER_COLOURS[pick % 4], _OTHER_MARKERS[pick // 4 % 4]
     return _styles(base, base.replace("_", " "), colour, marker)[name]

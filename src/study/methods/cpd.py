@@ -59,8 +59,13 @@ class Cpd:
 
     @classmethod
     def tuned(cls) -> Cpd:
-        """The best row of ``results/tuning/cpd.csv``, found on development subjects by tools/tune.py."""
+        """The best row of ``results/tuning/cpd.csv``: the visible surface of development subjects, by tools/tune.py."""
         return cls(alpha=0.2, beta_mm=30.0)
+
+    @classmethod
+    def tuned_whole(cls) -> Cpd:
+        """The best row of ``results/tuning/cpd_whole.csv``: the whole tube of the same subjects."""
+        return cls(alpha=0.2, beta_mm=50.0)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Drift ``source`` onto ``target``; nothing is drawn from ``rng``.

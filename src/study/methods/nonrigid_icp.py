@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import ClassVar
 
@@ -77,10 +77,15 @@ class NonrigidIcp:
 
     @classmethod
     def tuned(cls) -> NonrigidIcp:
-        """The best row of ``results/tuning/nonrigid_icp.csv``, found on development subjects by tools/tune.py."""
+        """The best row of ``results/tuning/nonrigid_icp.csv``: the visible surface of development subjects."""
         return cls(
             steps=((0.003, 10, 0.5, 10), (0.006, 5, 0.5, 10), (0.009, 2.5, 0.5, 10), (0.003, 0, 0.0, 10)), gamma=30.0
         )
+
+    @classmethod
+    def tuned_whole(cls) -> NonrigidIcp:
+        """The best row of ``results/tuning/nonrigid_icp_whole.csv``: the whole tube of the same subjects."""
+        return replace(cls.tuned(), distance_threshold=0.05)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Bend ``source`` onto ``target``; nothing is drawn from ``rng``.

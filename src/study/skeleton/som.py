@@ -14,6 +14,7 @@ from study.skeleton.graph import SkeletonGraph
 from study.types import Floats, Ints, Part, PointCloud
 
 RateSchedule = Literal["constant", "linear", "compounding"]
+RadiusSchedule = Literal["linear", "compounding"]
 Winners = Literal["any", "own_part"]
 
 N_CHECKS = 20  # of the quantisation error along the schedule
@@ -31,6 +32,8 @@ class SomParams:
         rate_schedule: ``"constant"`` (the paper), ``"linear"`` to 0, or ``"compounding"`` (the authors' code).
         radius: start of the neighbourhood radius in hops; it falls to 1 (`radius_at`). The paper states none; 5 is the
             authors' code's.
+        radius_schedule: ``"linear"`` in whole hops over the schedule (this study), or ``"compounding"`` (the authors'
+            code), at 1 hop after a few epochs.
         winners: ``"any"`` node may win a point (the paper); ``"own_part"`` only those of the point's labelled part.
         pretrain_epochs, pretrain_rate: epochs on the directed graph (3 at 0.02 in the paper).
 
@@ -43,6 +46,7 @@ class SomParams:
     rate: float = 0.1
     rate_schedule: RateSchedule = "constant"
     radius: float = 5.0
+    radius_schedule: RadiusSchedule = "linear"
     winners: Winners = "any"
     pretrain_epochs: int = 3
     pretrain_rate: float = 0.02
@@ -56,11 +60,15 @@ class SomParams:
             )
         if self.rate_schedule not in ("constant", "linear", "compounding"):
             raise StudyError(f"expected rate_schedule constant|linear|compounding, got {self.rate_schedule!r}")
+        if self.radius_schedule not in ("linear", "compounding"):
+            raise StudyError(f"expected radius_schedule linear|compounding, got {self.radius_schedule!r}")
         if self.winners not in ("any", "own_part"):
             raise StudyError(f"expected winners any|own_part, got {self.winners!r}")
 
     def rate_at(self, epoch: int) -> float:
-        """Learning rate of a main epoch."""
+        """Learning rate of an epoch; the pre-training ones come before 0, from ``-pretrain_epochs`` to -1."""
+        if epoch < 0:
+            return self.pretrain_rate
         if self.rate_schedule == "constant":
             return self.rate
         if self.rate_schedule == "linear":
@@ -69,8 +77,18 @@ class SomParams:
         return float(self.rate * np.prod(1 - np.arange(epoch + 1) / self.epochs))
 
     def radius_at(self, epoch: int) -> float:
-        """Neighbourhood radius of a main epoch, in hops: the authors' step rule."""
-        return float(int((self.radius - 1) * (1 - epoch / self.epochs)) + 1)
+        """Neighbourhood radius of an epoch, in hops; the epochs count as in `rate_at`."""
+        if self.radius_schedule == "linear":
+            return float(int((self.radius - 1) * (1 - max(epoch, 0) / self.epochs)) + 1)
+        # The authors' code applies that rule to the radius that it has just reached: every epoch takes a hop off,
+        # however long the schedule is, but the first (e = 0, in pre-training and again after it).
+        radius = self.radius
+        for k in range(-self.pretrain_epochs, epoch + 1):
+            if radius == 1:
+                break
+            e = k if k >= 0 else k + self.pretrain_epochs
+            radius = int((radius - 1) * (1 - e / self.epochs)) + 1
+        return float(radius)
 
 
 def neighbourhood(hops: Ints, radius: float) -> Floats:
@@ -130,22 +148,16 @@ def fit_som(
     nodes = np.array(graph.nodes.T, order="C")
     points = cloud.points
     classes, barred = _barred(graph, cloud, params.winners)
-
-    def train(theta: Floats, rate: float) -> None:
-        drawn = rng.integers(len(points), size=params.samples)
-        _epoch(nodes, points[drawn], classes[drawn], barred, theta, rate)
-
-    theta = neighbourhood(graph.hops(directed=True), params.radius)
-    for _ in range(params.pretrain_epochs):
-        train(theta, params.pretrain_rate)
-    undirected = graph.hops(directed=False)
-    radius, history = np.nan, []
-    for epoch in range(params.epochs):
+    hops, radius, history = graph.hops(directed=True), np.nan, []
+    for epoch in range(-params.pretrain_epochs, params.epochs):
+        if epoch == 0:
+            hops, radius = graph.hops(directed=False), np.nan
         if params.radius_at(epoch) != radius:
             radius = params.radius_at(epoch)
-            theta = neighbourhood(undirected, radius)
-        train(theta, params.rate_at(epoch))
-        if epoch % max(1, params.epochs // N_CHECKS) == 0 or epoch == params.epochs - 1:
+            theta = neighbourhood(hops, radius)
+        drawn = rng.integers(len(points), size=params.samples)
+        _epoch(nodes, points[drawn], classes[drawn], barred, theta, params.rate_at(epoch))
+        if epoch >= 0 and (epoch % max(1, params.epochs // N_CHECKS) == 0 or epoch == params.epochs - 1):
             history.append(quantisation_error_mm(nodes.T, points))
     return graph.with_nodes(nodes.T), tuple(history)
 

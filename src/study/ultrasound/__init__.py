@@ -1,6 +1,7 @@
 """Tracked ultrasound (sec. II): calibrations, masks to cloud; the virtual sweep and the sizes of its errors."""
 
 from study.ultrasound.cloud import SweepCloud, SweepReport, contour_points, sweep_cloud, thin_evenly, upper_contour
+from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.probe import Probe
 from study.ultrasound.spatial import SpatialCalibration, calibrate_spatial
 from study.ultrasound.sweep_errors import ERROR_SOURCES, LATENCY_S, SweepErrors, budget_cases, error_table
@@ -23,6 +24,7 @@ __all__ = [
     "budget_cases",
     "calibrate_latency",
     "calibrate_spatial",
+    "constant_shift_mm",
     "contour_points",
     "error_table",
     "simulate_calibration_views",

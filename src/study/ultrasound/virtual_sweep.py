@@ -132,6 +132,12 @@ def _delay_in_fat(errors: SweepErrors, depth: Floats) -> Floats:
     return np.minimum(errors.fat_mm, depth) * (SPEED_ASSUMED_M_S / SPEED_FAT_M_S - 1)
 
 
+def fat_delay_mm(errors: SweepErrors, shown: Floats) -> Floats:
+    """How much of the depths (n,) mm that the machine shows is delay in fat: `_delay_in_fat`, seen from behind it."""
+    slow = SPEED_ASSUMED_M_S / SPEED_FAT_M_S
+    return np.minimum(errors.fat_mm * (slow - 1), np.maximum(shown, 0.0) * (1 - 1 / slow))
+
+
 def _contour_jitter(errors: SweepErrors, rng: np.random.Generator, shape: tuple[int, ...], pixel_mm: float) -> Floats:
     """Smooth error (f, w) mm of the annotated line, independent from frame to frame."""
     sigma = JITTER_LENGTH_MM / pixel_mm
