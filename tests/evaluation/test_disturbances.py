@@ -8,13 +8,13 @@ import pytest
 from study.errors import StudyError
 from study.evaluation.disturbances import KINDS, SEEDS, Disturbance, disturbed_pair, levels
 from study.geometry.points import nearest
-from study.params import PHANTOM_SEED
+from study.params import PHANTOM_SEED, POPULATION_SEED
 from study.phantom import anterior_cloud, draw_subject
 from study.seeds import named_rng
 from study.types import Part
 
 SMALL = Disturbance(ct_points=800, us_points=1500)
-SEED = 503
+SEED = 523
 
 
 def us_of(**changes):
@@ -34,7 +34,7 @@ def test_levels_are_listed_by_kind_and_one_of_each_is_a_careful_acquisition():
 
 
 def test_the_people_are_those_of_nobody_else():
-    others = {0, PHANTOM_SEED, *range(101, 127), *range(201, 209), *range(301, 307), *range(401, 411)}
+    others = {0, PHANTOM_SEED, POPULATION_SEED, *range(101, 127), *range(201, 209), *range(301, 307), *range(401, 411)}
     assert len(SEEDS) >= 20
     assert not others & set(SEEDS)
 

@@ -35,7 +35,7 @@ def test_choices_are_those_of_the_graph_and_those_around_it():
 @pytest.fixture(scope="module")
 def rows():
     listed = [one for one in settings(QUICK) if one.choice in CHOICES]
-    return pd.DataFrame(sensitivity_rows(503, listed, (0, 1), SMALL))
+    return pd.DataFrame(sensitivity_rows(523, listed, (0, 1), SMALL))
 
 
 def value(rows, option, metric, seed=0):

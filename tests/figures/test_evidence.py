@@ -16,13 +16,20 @@ from study.evaluation.sensitivity import MEASURES
 
 def levels() -> pd.DataFrame:
     rows = []
-    for kind in KINDS:
+    for kind, named in KINDS.items():
         for k, level in enumerate((0.0, 1.0, 2.5)):
             for j, method in enumerate(("coarse", "icp_tuned", "skeleton_graph")):
                 median = 2.0 + k + 0.3 * j
                 spread = {"p5": median - 1, "p95": median + 2, "low": median - 0.4, "high": median + 0.5}
                 counts = {"draws": 20, "by_hand": 3 if k == 2 else 0, "failed": 4 if (k, j) == (2, 1) else 0}
-                what = {"kind": kind, "level": level, "method": method, "metric": "true_waypoint_error"}
+                what = {
+                    "kind": kind,
+                    "title": named.title,
+                    "unit": named.unit,
+                    "level": level,
+                    "method": method,
+                    "metric": "true_waypoint_error",
+                }
                 rows.append({**what, "median": median, **spread, **counts})
     return pd.DataFrame(rows)
 

@@ -10,7 +10,7 @@ from study.geometry.points import fit_rigid
 from study.phantom.between import between
 from study.phantom.surface import canonical_surface
 
-START, END = phantom.draw_subject("ct1", 501), phantom.draw_subject("patient", 501)
+START, END = phantom.draw_subject("ct1", 521), phantom.draw_subject("patient", 521)
 PLACES = np.random.default_rng(0).uniform([-80, -6, -100], [80, 6, 5], (300, 3))
 
 

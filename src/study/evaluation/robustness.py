@@ -13,7 +13,7 @@ from study.alignment.chest import Alignment, find_chest
 from study.alignment.sizes import size_warnings
 from study.errors import StudyError
 from study.evaluation.distances import waypoint_errors_mm
-from study.evaluation.disturbances import Disturbance, DisturbedPair, disturbed_pair
+from study.evaluation.disturbances import KINDS, Disturbance, DisturbedPair, disturbed_pair
 from study.pipeline import find_method, register_aligned, run_method
 from study.seeds import named_rng
 from study.types import PointCloud
@@ -115,9 +115,10 @@ def robustness_summary(rows: pd.DataFrame) -> pd.DataFrame:
         rows: `robustness_rows` with ``kind`` and ``level``.
 
     Returns:
-        by ``kind``, ``level``, ``method`` and ``metric``: ``draws``, ``median``, ``p5`` and ``p95`` over draws, ``low``
-        and ``high`` (95 % bootstrap interval of the median), and how many draws ``warned``, were started ``by_hand`` or
-        ``failed``; mm, NaN where all draws failed. A started draw counts in the median, a failed one cannot.
+        by ``kind``, ``level``, ``method`` and ``metric``: ``title`` and ``unit`` of the kind, ``draws``, ``median``,
+        ``p5`` and ``p95`` over draws, ``low`` and ``high`` (95 % bootstrap interval of the median), and how many draws
+        ``warned``, were started ``by_hand`` or ``failed``; mm, NaN where all draws failed. A draw started by hand
+        counts in the median, a failed one cannot.
     """
     keys = ["kind", "level", "method", "metric"]
     found = []
@@ -129,6 +130,7 @@ def robustness_summary(rows: pd.DataFrame) -> pd.DataFrame:
         found.append(
             {
                 **dict(zip(keys, key, strict=True)),
+                **{"title": KINDS[str(key[0])].title, "unit": KINDS[str(key[0])].unit},
                 "draws": len(some),
                 **{"median": median, "p5": p5, "p95": p95, "low": low, "high": high},
                 "warned": int((status == WARNED).sum()),

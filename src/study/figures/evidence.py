@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from study.evaluation.disturbances import KINDS
 from study.evaluation.metrics import METRICS
 from study.evaluation.pair import in_order
 from study.figures.canvas import below, new_figure, plain, require, require_columns
@@ -19,7 +18,22 @@ from study.figures.style import DARK, GREY, method_style
 
 __all__ = ["choices", "robustness"]
 
-_SUMMARY = ("kind", "level", "method", "metric", "draws", "median", "p5", "p95", "low", "high", "by_hand", "failed")
+_SUMMARY = (
+    "kind",
+    "title",
+    "unit",
+    "level",
+    "method",
+    "metric",
+    "draws",
+    "median",
+    "p5",
+    "p95",
+    "low",
+    "high",
+    "by_hand",
+    "failed",
+)
 _COLUMNS = 3
 _LUCK_COLOUR = "#e8e8e8"
 _BAND_COLOUR = "#dddddd"
@@ -51,15 +65,16 @@ def robustness(summary: pd.DataFrame, metric: str = "true_waypoint_error") -> Fi
     require_columns(summary, _SUMMARY, "a robustness summary")
     rows = summary[summary["metric"] == metric]
     require(rows, f"rows of metric {metric!r}")
-    kinds, methods = [kind for kind in KINDS if kind in set(rows["kind"])], in_order(rows["method"])
+    kinds, methods = list(dict.fromkeys(rows["kind"])), in_order(rows["method"])
     n_rows = -(-len(kinds) // _COLUMNS)
     figure = new_figure(1.5 + 3.0 * n_rows, f"{METRICS[metric].title} as the clouds get worse (synthetic people)")
     panels = figure.subplots(n_rows, _COLUMNS, squeeze=False, sharey=True).ravel()
     top = 1.25 * float(rows["high"].max())
     for ax, kind in zip(panels, kinds, strict=False):
-        _draw_kind(ax, rows[rows["kind"] == kind], methods, top)
-        plain(ax, KINDS[kind].title)
-        ax.set_xlabel(KINDS[kind].unit, fontsize=8)
+        mine = rows[rows["kind"] == kind]
+        _draw_kind(ax, mine, methods, top)
+        plain(ax, mine["title"].iloc[0])
+        ax.set_xlabel(mine["unit"].iloc[0], fontsize=8)
     for ax in panels[::_COLUMNS]:
         ax.set_ylabel("mean over the waypoints (mm)", fontsize=8)
     for ax in panels[len(kinds) :]:
