@@ -149,8 +149,8 @@ def reading(runs: dict[str, Run]) -> str:
         f"3. **By the truth the order turns round**: waypoints end {listed(true, GRAPH, known)} mm off on {truths}, "
         f"those of CPD tuned on the whole tube {listed(true, whole, known)}, on the visible surface "
         f"{listed(true, visible, known)}. The known deformation itself scores "
-        f"{listed(protocol, TRUTH, known)} mm by the paper's protocol, more than the graph: the measures reward carrying "
-        "the whole tube onto the visible sheet.\n"
+        f"{listed(protocol, TRUTH, known)} mm by the paper's protocol, more than the graph: the measures reward "
+        "carrying the whole tube onto the visible sheet.\n"
     )
 
 
