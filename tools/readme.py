@@ -159,10 +159,9 @@ def section() -> str:
     runs = {name: Run(REFERENCE / name) for name in reported()}
     known = next(name for name, run in runs.items() if run.has_truth)
     note = (
-        "`phantom`: synthetic CTs to one synthetic patient; `planted`: a real CT to itself under known deformations; "
-        "`open`: ordered pairs of real people. Every patient is a virtual sweep with its errors. All methods, data "
-        "sets and measures, with the paper's own numbers: [results/TABLES.md](results/TABLES.md); each claim of the "
-        "paper: [results/claims.md](results/claims.md).\n"
+        "Means over pairs with 95 % intervals over people. All methods, data sets and measures, with the paper's own "
+        "numbers: [results/TABLES.md](results/TABLES.md). Each claim of the paper with ours beside it: "
+        "[results/claims.md](results/claims.md).\n"
     )
     return "\n".join([reading(runs), small_table(runs[known]) + "\n", note])
 
