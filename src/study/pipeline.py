@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from study.alignment.chest import Alignment, align
+from study.alignment.chest import Alignment, Chest, find_chest
 from study.alignment.sizes import size_warnings
 from study.errors import StudyError
-from study.geometry.points import principal_axes, unit
+from study.geometry.points import nearest, principal_axes, unit
 
 # The methods import these, and with them Open3D, trimesh and pycpd, on first use. Whoever runs methods, here or in a
 # batch, loads them before: a limit of threads holds only for the pools that are there when it is set, and Open3D brings
@@ -23,10 +23,11 @@ from study.methods.visible_surface import carry
 from study.quality import QUALITY_LIMITS, SWAPPED, measure_quality, quality_warnings
 from study.registration import Method, Registration
 from study.seeds import named_rng
-from study.types import PointCloud, as_points
+from study.types import Floats, PointCloud, as_points
 from study.ultrasound.cloud import SweepCloud, thin_evenly
 
-MIN_SPACING_MM = 2.0  # of the points that a method sees; at 1.5 a side given 5 times still weighed more
+FINE_MM = 1.5  # spacing of the points in which the chest is found
+MIN_SPACING_MM = 2.0  # of those that a method sees
 EVEN_SHARE = 0.7  # of the typical distance to the nearest neighbour: random scatter keeps most of its points
 CARRIERS = 8  # points a method saw, whose rigid motion carries a given one
 
@@ -85,7 +86,7 @@ def register_pair(
     """
     chosen = find_method(method)
     given, seen = _as_cloud(ct, "ct"), _as_cloud(us, "us", front)
-    alignment = align(_evened(given), _evened(seen))
+    alignment = Alignment(_even_chest(given), _even_chest(seen))
     result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
     if len(alignment.source.cloud) == len(given):
         return result
@@ -101,22 +102,35 @@ def _as_cloud(given: ArrayLike | PointCloud | SweepCloud, name: str, front: Arra
     return PointCloud(points, name, front=known if front is None else unit(front, "front"))
 
 
-def _evened(cloud: PointCloud) -> PointCloud:
-    """The cloud thinned to an even density; the points themselves where they are even.
+def _even_chest(cloud: PointCloud) -> Chest:
+    """The chest in a cloud, with points of an even density; the points themselves where they are even.
 
-    What is denser than its surroundings is thinned to the spacing that is typical by area: by number, a patch sampled
-    20 times would be typical of the whole.
+    It is found among more points than the method sees: the coarse alignment needs every one of a sparse cloud, but a
+    side that was given five times would still weigh more.
     """
     centre, axes = principal_axes(cloud.points)
     local = (cloud.points - centre) @ axes.T  # so that a moved cloud keeps the same points
-    thinned = thin_evenly(local, MIN_SPACING_MM)
+    kept = _evened(local, FINE_MM)
+    chest = find_chest(cloud if len(kept) == len(cloud) else replace(cloud, points=kept @ axes + centre))
+    seen = _evened(local, MIN_SPACING_MM)
+    if len(seen) in (len(kept), len(cloud)):
+        return chest
+    _, like = nearest(seen, kept)
+    assert chest.cloud.parts is not None
+    return replace(chest, cloud=replace(chest.cloud, points=seen @ axes + centre, parts=chest.cloud.parts[like]))
+
+
+def _evened(local: Floats, spacing_mm: float) -> Floats:
+    """Points (k, 3) mm thinned to the spacing that is typical by area, or ``spacing_mm`` where that is more.
+
+    By number, a patch sampled 20 times would be typical of the whole.
+    """
+    thinned = thin_evenly(local, spacing_mm)
     spacing, _ = KDTree(thinned).query(thinned, k=[2])
     ordered = np.sort(spacing[:, 0])
     area = np.cumsum(ordered**2)
-    spacing_mm = EVEN_SHARE * float(ordered[np.searchsorted(area, area[-1] / 2)])
-    if spacing_mm > MIN_SPACING_MM:
-        thinned = thin_evenly(local, spacing_mm)
-    return cloud if len(thinned) == len(cloud) else replace(cloud, points=thinned @ axes + centre)
+    typical_mm = EVEN_SHARE * float(ordered[np.searchsorted(area, area[-1] / 2)])
+    return thin_evenly(local, typical_mm) if typical_mm > spacing_mm else thinned
 
 
 def register_aligned(

@@ -10,13 +10,15 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import yaml
 from phantom_files import SMALL, cached_ct_volume
 
 from study import METHODS as METHODS_BY_NAME
 from study import phantom
 from study.batch import cases, open_run, run_dataset, run_parameters, run_study, runs, why_stale
 from study.batch.workers import Outcome, Workers
-from study.datasets import Anatomy, Dataset, PhantomDataset, PlantedDataset, find_dataset
+from study.data.manifest import load_manifest
+from study.datasets import Anatomy, Dataset, PhantomDataset, PlantedDataset, PlantedEveryDataset, find_dataset
 from study.errors import StudyError
 from study.evaluation.pair import TRUTH
 from study.params import StudyParams
@@ -99,6 +101,7 @@ def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
     assert provenance["parameters"]["study"]["ct_points"] == SMALL.ct_points
     assert sorted(provenance["parameters"]["methods"]) == list(METHODS)
     assert list(provenance["inputs_sha256"]) == ["data_manifest.yaml"]
+    assert 50 < provenance["peak_memory_mb"] < 100_000  # an interpreter with its libraries; less than any machine has
 
 
 # --- what fails ------------------------------------------------------------------------------------------------------
@@ -242,6 +245,7 @@ def test_a_stopped_run_does_only_what_is_missing(
     assert done == ["ct:ct1", "ct:ct1"]
     assert run.failures.empty
     assert len(run.timings) == 3 + 1 + 3 + 6
+    assert run.provenance["peak_memory_mb"] > 50
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
@@ -343,6 +347,42 @@ def test_the_planted_source_is_read_once(monkeypatch: pytest.MonkeyPatch) -> Non
     assert {row["status"] for row in done} == {"ok"}
     assert {row["metric"] for row in done} >= {"true_error_mean", "true_waypoint_error"}
     assert sum(row["stage"] == "anatomy" for row in timings) == 4
+
+
+def test_each_sweep_of_a_patient_is_a_case_of_its_own_and_the_first_is_the_only_ones(
+    tmp_path: Path, known_people: None, first: Path
+) -> None:
+    raw = {"kind": "generated", "sweeps": 2, "subjects": {"ct1": {"role": "ct"}, "patient": {"role": "patient"}}}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump({"cohorts": {"phantom": raw}}))
+    swept = find_dataset("phantom", SMALL, manifest=load_manifest(tmp_path / "own.yaml"))
+    run = run_study(swept, tmp_path / "out", methods=["coarse"])
+    assert run.failures.empty
+    assert set(run.metrics["target"]) == {"patient", "patient#1"}
+    assert run.timings["stage"].value_counts().to_dict() == {
+        "anatomy": 2, "sweep": 2, "coarse ct": 1, "coarse us": 2, "register": 4
+    }  # fmt: skip
+    assert run.overview()["patients"] == 1
+    again, other = (run.metrics.query("method == 'coarse' and target == @name") for name in ("patient", "patient#1"))
+    alone = read_metrics(first / "metrics.csv").query("method == 'coarse'")
+    assert again["value"].to_list() == alone["value"].to_list()
+    assert other["value"].to_list() != alone["value"].to_list()
+
+
+def test_planted_patients_of_every_ct_go_the_whole_road(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = PlantedEveryDataset.anatomy
+
+    def load(self: Dataset, name: str, origin: Anatomy | None = None) -> Anatomy:
+        return whole(self, name, origin) if origin is not None else replace(known("ct3"), name=name)
+
+    monkeypatch.setattr(PlantedEveryDataset, "anatomy", load)
+    monkeypatch.setattr(PlantedEveryDataset, "fetch", lambda *_: None)
+    rows, _ = run_dataset(people(replace(SMALL, max_targets=6), name="planted_every"), methods=["coarse"])
+    done = {(row["source"], row["target"]) for row in rows if row["status"] == "ok"}
+    pairs = [("lidc-0001", f"lidc-0001+planted{k}") for k in range(1, 6)]
+    other = ("totalseg-example", "totalseg-example+planted1")
+    assert {(row["source"], row["target"]) for row in rows} == {*pairs, other}
+    assert len(done) >= 4  # at 3 mm the coarse alignment may refuse one
+    assert {row["metric"] for row in rows} >= {"true_error_mean", "true_waypoint_error"}
 
 
 # --- workers and tables ----------------------------------------------------------------------------------------------

@@ -49,7 +49,11 @@ def _without_aliases(raw: object) -> str:
 
 
 def test_the_repository_s_manifest_has_the_cohorts_the_study_names(own: Manifest) -> None:
-    assert list(own.cohorts) == ["phantom", "planted", "open", "ribseg", "totalsegmentator"]
+    assert list(own.cohorts) == [
+        *("phantom", "planted", "open"),
+        *("population", "planted_every", "open_sweeps"),
+        *("ribseg", "totalsegmentator"),
+    ]
     assert list(own.cohort("open").subjects) == ["lidc-0001", "totalseg-example", "lung1", "lung2"]
     assert list(own.cohort("phantom").subjects) == ["ct1", "ct2", "ct3", "ct4", "ct5", "patient"]
     assert own.cohort("phantom").kind == "generated"

@@ -14,6 +14,12 @@ T_US_RAS = RigidTransform.random(np.random.default_rng(11))
 
 
 @pytest.fixture(scope="session")
+def T_us_ras() -> RigidTransform:
+    """RAS+ to the patient's tracker."""
+    return T_US_RAS
+
+
+@pytest.fixture(scope="session")
 def real_pair(ct_clouds: dict[str, PointCloud], us_cloud: PointCloud) -> Pair:
     """ct1 and the patient in a tracker's frame, as if they were two real people."""
     labelled = us_cloud.moved(T_US_RAS)

@@ -108,13 +108,18 @@ def test_a_shift_of_every_row_of_a_method_differs_though_each_row_is_within_tole
     assert "1 mean(s) beyond tolerance" in comparison.report()
 
 
-def test_an_order_that_turns_differs_however_little_moved(run):
-    rows = [
+def three_methods(lead):
+    """Rows of three methods, each ``lead`` mm ahead of the next."""
+    return [
         row
         for k, method in enumerate(("skeleton_graph", "icp", "cpd"))
         for source in ("ct1", "ct2")
-        for row in metric_rows(Case("phantom", source, "p", method, 0), {"hd": 8.0 + 0.004 * k, "msd": 1.0})
+        for row in metric_rows(Case("phantom", source, "p", method, 0), {"hd": 8.0 + lead * k, "msd": 1.0})
     ]
+
+
+def test_an_order_that_turns_differs_however_little_moved(run):
+    rows = three_methods(0.004)
     reference = run("a", rows)
     comparison = compare(reference, run("b", shifted(rows, "skeleton_graph", 0.006, "hd")))
     assert comparison.differences.empty
@@ -122,8 +127,18 @@ def test_an_order_that_turns_differs_however_little_moved(run):
     assert comparison.exit_code == 1
     report = comparison.report()
     assert "phantom, hd: by mean skeleton_graph < icp < cpd; now icp < skeleton_graph < cpd" in report
-    assert "phantom, smallest Hausdorff distance on every CT: 2 of 2; now 0 of 2" in report
+    difference = "Hausdorff distance smaller than that of ICP (difference of means, mm)"
+    assert f"phantom, {difference}: yes; now no" in report
     assert compare(reference, run("c", shifted(rows, "skeleton_graph", 0.003, "hd"))).agrees
+
+
+def test_a_lead_that_becomes_a_tie_differs(run):
+    rows = three_methods(0.012)
+    comparison = compare(run("a", rows), run("b", shifted(rows, "skeleton_graph", 0.006, "hd")))
+    assert comparison.differences.empty
+    assert comparison.shifts.empty
+    told = "smallest Hausdorff distance on every CT (share of pairs): 2 of 2; now 0 of 2, 2 tied"
+    assert comparison.upsets == (f"phantom, {told}",)
 
 
 def test_the_reference_with_one_method_moved_differs(run):

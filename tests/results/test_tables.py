@@ -1,3 +1,4 @@
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,22 @@ def test_one_ct_with_several_patients_has_them_as_columns(tmp_path: Path) -> Non
     write_tables(rows_of([("a", "p1"), ("a", "p2")]), tmp_path)
     assert [path.stem for path in tmp_path.glob("*.md")] == ["hd_table"]
     assert {"p1", "p2"} <= set(pd.read_csv(tmp_path / "hd_table.csv").columns)
+
+
+def test_sweeps_of_a_patient_share_a_table_and_many_patients_one(tmp_path: Path) -> None:
+    for name in ("swept", "many"):
+        (tmp_path / name).mkdir()
+    swept = rows_of([(a, b) for a, b in permutations("abc", 2)] + [("b", "a#1"), ("c", "a#1"), ("a", "b#1")])
+    swept.loc[swept["target"] == "a#1", "value"] = 11.0
+    write_tables(swept, tmp_path / "swept")
+    stems = {"hd_table_a", "hd_table_b", "hd_table_c", "hd_all_pairs"}
+    assert {path.stem for path in (tmp_path / "swept").glob("*.md")} == stems
+    ours = pd.read_csv(tmp_path / "swept" / "hd_table_a.csv").query("data == 'this study'")
+    assert ours[["b", "c", "n"]].to_numpy().tolist() == [[10.0, 10.0, 2]]
+    assert pd.read_csv(tmp_path / "swept" / "hd_all_pairs.csv")["n"].iloc[0] == 6
+    write_tables(rows_of(list(permutations("abcdefg", 2))), tmp_path / "many")
+    assert {path.stem for path in (tmp_path / "many").glob("*.md")} == {"hd_table"}
+    assert pd.read_csv(tmp_path / "many" / "hd_table.csv")["n"].iloc[0] == 7
 
 
 def test_a_table_of_failures_only_can_be_written(tmp_path: Path) -> None:

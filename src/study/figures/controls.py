@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
@@ -23,7 +25,7 @@ __all__ = ["hausdorff_point", "rank_agreement", "truth_floor"]
 
 _MEASURED, _FLOOR = "#0077BB", "#c8c8c8"
 _DATASETS = (("#0077BB", "o"), ("#CC3311", "s"), ("#009988", "^"), ("#EE7733", "D"))  # Paul Tol's vibrant scheme
-_UNSEEN = lighter(CT_COLOUR, 0.62)
+_UNSEEN = to_hex(lighter(CT_COLOUR, 0.62))
 _SLAB_MM = 8.0  # half the thickness of the slice that the side view shows
 
 
@@ -63,7 +65,7 @@ def _draw_steps(ax: Axes, steps: Sequence[str], rows: pd.DataFrame) -> None:
     for y, step in enumerate(steps):
         values = rows.loc[rows["step"] == step, "value"].to_numpy()
         if not len(values):
-            ax.text(0.02 * longest, y, "not bounded by it", va="center", fontsize=7.5, color=GREY)
+            ax.text(0.02 * longest, y, "does not apply", va="center", fontsize=7.5, color=GREY)
             continue
         ax.barh(y, values.mean(), height=0.66, color=_FLOOR if step.startswith("floor") else lighter(_MEASURED, 0.35))
         ax.scatter(values, y + spread(len(values), 0.4), s=9, c=DARK, lw=0, zorder=3)
@@ -101,11 +103,11 @@ def hausdorff_point(
     require(np.asarray(warped), "a warped cloud")
     distance = float(np.linalg.norm(np.subtract(place, partner)))
     figure = new_figure(5.2, f"The point that decides a Hausdorff distance of {distance:.1f} mm ({note})")
-    front, side = figure.subplots(1, 2, width_ratios=[1.25, 1])
+    front, side = figure.subplots(1, 2, width_ratios=[1.8, 1])
     left = T_us_chest.inverse.apply(np.atleast_2d(place))[0, 0]
     views: tuple[tuple[Axes, View, str], ...] = (
         (front, "front", "from the front; shaded: the slice at the right"),
-        (side, "side", f"slice of {2 * _SLAB_MM:g} mm, from the patient's right"),
+        (side, "side", f"{2 * _SLAB_MM:g} mm slice, from the right"),
     )
     for ax, view, title in views:
         clouds = [project(points, view, T_us_chest) for points in (warped, us)]
@@ -116,7 +118,7 @@ def hausdorff_point(
         _draw_clouds(ax, clouds[0], seen, clouds[1], size=3.0 if view == "front" else 14.0)
         ends = project(np.array([place, partner], dtype=np.float64), view, T_us_chest)
         _draw_distance(ax, ends, distance)
-        look(ax, view, bounds(*clouds, margin_mm=6.0), title)
+        look(ax, view, bounds(*clouds, margin_mm=6.0 if view == "front" else 18.0), title)
     front.axvspan(left - _SLAB_MM, left + _SLAB_MM, color="#eeeeee", lw=0, zorder=0)
     colours: dict[str, Any] = {
         "CT, unseen by a probe": _UNSEEN,
@@ -139,7 +141,7 @@ def _draw_distance(ax: Axes, ends: Floats, distance: float) -> None:
     ax.plot(ends[:, 0], ends[:, 1], color="black", lw=1.5, zorder=5)
     ax.plot(x, y, marker="*", ms=14, color="black", mec="white", zorder=6)
     halo = [withStroke(linewidth=3, foreground="white")]
-    at: dict[str, Any] = {"xytext": (9, 9), "textcoords": "offset points", "fontsize": 9, "weight": "bold"}
+    at: dict[str, Any] = {"xytext": (8, -15), "textcoords": "offset points", "fontsize": 9, "weight": "bold"}
     ax.annotate(f"{distance:.1f} mm", (x, y), zorder=7, path_effects=halo, **at)
 
 
@@ -169,17 +171,21 @@ def rank_agreement(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
         ax.axvline(0, color=DARK, lw=0.8)
         ax.set_xlim(low, 1.05)
         ax.grid(axis="x", alpha=0.3)
-        plain(ax, METRICS[truth].title + " (mm)")
+        plain(ax, fill(f"{METRICS[truth].title} (mm)", 30))
         ax.set_xlabel("rank correlation over the methods", fontsize=8)
-    name_rows(
-        panels[0], [METRICS[measure].title.replace(" of the visible part", ", visible part") for measure in measures]
-    )
+    name_rows(panels[0], [_part_last(METRICS[measure].title) for measure in measures])
     marks: list[Any] = [
         Line2D([], [], ls="", marker=marker, color=colour, mec="black", label=f"{dataset}: mean; dot: a pair")
         for dataset, (colour, marker) in zip(datasets, _DATASETS * len(datasets), strict=False)
     ]
     below(figure, marks, 4)
     return figure
+
+
+def _part_last(title: str) -> str:
+    """``Waypoint error of the visible part in depth`` with its part at the end, where the eye compares rows."""
+    part = " of the visible part"
+    return title.replace(part, "") + (part.replace(" of the", ",") if part in title else "")
 
 
 def _draw_agreement(
@@ -190,5 +196,5 @@ def _draw_agreement(
         values = rows.loc[rows["measure"] == measure, "rho"].dropna().to_numpy()
         if len(values):
             ax.plot([values.min(), values.max()], [y + aside] * 2, color=colour, lw=1.2, alpha=0.6)
-            ax.scatter(values, np.full(len(values), y + aside), s=7, c=colour, lw=0, alpha=0.7)
+            ax.scatter(values, np.full(len(values), y + aside), s=12, c=colour, lw=0, alpha=0.7)
             ax.plot(values.mean(), y + aside, marker=marker, ms=6, color=colour, mec="black", zorder=4)
