@@ -77,7 +77,7 @@ def test_the_reference_alone_is_enough(tmp_path):
     assert {"reproduced", "partly", "not", TIE, UNTESTABLE} <= set(again["verdict"])
     text = page.read_text(encoding="utf-8")
     assert all(claim.text in text for claim in CLAIMS)
-    assert "| `study run --dataset open`" in text
+    assert "| `study run --dataset open" in text
 
 
 def test_the_tool_tells_a_stale_table(tmp_path, monkeypatch, capsys):
