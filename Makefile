@@ -45,6 +45,7 @@ check: $(STAMP)  ## ruff, types, import layers, notebook pairing
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/notebooks.py check
+	$(BIN)/python tools/claims.py check
 	$(BIN)/python tools/readme.py check
 
 notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
@@ -54,6 +55,7 @@ reference: $(STAMP)  ## renew results/reference from results/runs (a CHANGELOG e
 	for d in $$($(BIN)/study datasets --reported); do \
 	  rm -rf results/reference/$$d && cp -r $(RUNS)/$$d results/reference/$$d; done
 	$(BIN)/study anatomy --dataset open --out results/anatomy.csv
+	$(BIN)/python tools/claims.py write
 	$(BIN)/python tools/readme.py write
 
 bench: $(STAMP)  ## ratios and rates quoted in the README
