@@ -101,7 +101,8 @@ pd.DataFrame({title: means.loc[metric] for title, metric in COLUMNS.items()}).ro
 # %% [markdown]
 # ## Parameters and surface apart
 # Each method as shipped and tuned, on the whole tube and on its visible surface, every cell tuned for itself on
-# development people. By the paper's measures the whole tube wins everywhere; by the truth the visible surface does.
+# development people. For every method that bends, the whole tube wins by the paper's measures and the visible surface
+# by the truth.
 
 # %%
 CELLS = {
@@ -124,7 +125,10 @@ pd.DataFrame(table).T.rename_axis(["mean over pairs (mm)", "parameters", "surfac
 # ## What a registration does to the cloud
 # Shares of neighbouring points torn apart or crushed, of points on another cartilage than their own, and folded over,
 # and the motion after the coarse alignment. The published graph tears: neighbours that follow different nodes part, and
-# the cartilages fall into stripes (notebook 40 draws them). `truth` has next to none.
+# the cartilages fall into stripes (notebook 40 draws them). The cause is that a node's motion is fitted to the 3
+# closest nodes, itself among them: fitted to all within 3 hops, as in the authors' code (`skeleton_graph_authors`), or
+# within one hop and with winners of a point's own part (`skeleton_graph_tuned_whole`), most of it goes. `truth` has
+# next to none.
 
 # %%
 TEARING = ["stretched_share", "wrong_part_share", "folded_share", "further_motion"]
