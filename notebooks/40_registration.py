@@ -43,9 +43,9 @@ pd.DataFrame({"points": [len(ct), len(us)]}, index=[f"CT of {source}", f"US of {
 # ## Every method from the same start
 # `coarse` is the start itself. A plain name is the method as published, or as its library ships it. `_visible`
 # registers only the half of the tubes that a probe can see, `_tuned` does so with parameters from a grid on development
-# subjects that are reported nowhere else, `_tuned_whole` was tuned on the whole tube; `skeleton_graph_authors` has every
-# choice of the authors' code. The skeleton graph has converged if the errors of its two
-# maps no longer fell when their schedules ended. Seconds are of this machine and this run.
+# subjects that are reported nowhere else, `_tuned_whole` was tuned on the whole tube; `skeleton_graph_authors` has
+# every choice of the authors' code. The skeleton graph has converged if the errors of its two maps no longer fell when
+# their schedules ended. Seconds are of this machine and this run.
 
 # %%
 results = {
