@@ -72,7 +72,7 @@ def test_data_folder_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch,
 
 def test_the_list_has_a_row_for_every_file_of_every_subject() -> None:
     table = data_list(load_manifest())
-    assert len(table) == 6 + 10 + 3 * 27
+    assert len(table) == 2 * 6 + 10 + 3 * 27  # open and open_sweeps share their files
     assert set(table.loc[table["dataset"] == "ribseg", "status"]) == {"absent", "to be put in place"}
     assert (table[["licence", "title", "source"]] != "").all(axis=None)
     assert len(data_list(load_manifest(), "open")) == 6
