@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 JOBS ?= 2
 RUNS := results/runs
-EVIDENCE := results/evidence
+EVIDENCE := results/runs/evidence
 export PYTHONHASHSEED := 0
 # One arithmetic thread a process: sums then have one order, and two workers do not fight over two cores.
 export OMP_NUM_THREADS := 1
@@ -51,9 +51,12 @@ check: $(STAMP)  ## ruff, types, import layers, notebook pairing
 notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
 	$(BIN)/python tools/notebooks.py write --jobs $(JOBS)
 
-reference: $(STAMP)  ## renew results/reference from results/runs (a CHANGELOG entry says why)
+reference: $(STAMP)  ## renew results/reference and results/evidence from results/runs (a CHANGELOG entry says why)
 	for d in $$($(BIN)/study datasets --reported); do \
 	  rm -rf results/reference/$$d && cp -r $(RUNS)/$$d results/reference/$$d; done
+	for part in robustness sensitivity people; do if [ -d $(EVIDENCE)/$$part ]; then \
+	  mkdir -p results/evidence && rm -rf results/evidence/$$part && cp -r $(EVIDENCE)/$$part results/evidence/$$part; \
+	  fi; done
 	$(BIN)/study anatomy --dataset open --out results/anatomy.csv
 	$(BIN)/python tools/claims.py write
 	$(BIN)/python tools/readme.py write

@@ -2,7 +2,8 @@
 
     python tools/claims.py write | check [FOLDER ...] [--out results]
 
-The runs are those below the folders given, results/reference when none is; nothing is run.
+The runs are those below the folders given, results/reference when none is; the rows of results/evidence/people, of more
+people, are added. Nothing is run.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from study.errors import StudyError
-from study.results import REFERENCE, find_runs, write_claims
+from study.results import REFERENCE, evidence, find_runs, write_claims
+
+PEOPLE = evidence.KEPT / evidence.PEOPLE
 
 
 def main() -> int:
@@ -26,12 +29,12 @@ def main() -> int:
     try:
         runs = [run for folder in options.folders for run in find_runs(folder)]
         if options.what == "write":
-            print(*write_claims(runs, options.out), sep="\n")
+            print(*write_claims(runs, options.out, PEOPLE), sep="\n")
             return 0
         with TemporaryDirectory() as folder:
             stale = [
                 path.name
-                for path in write_claims(runs, Path(folder))
+                for path in write_claims(runs, Path(folder), PEOPLE)
                 if not (old := options.out / path.name).is_file() or path.read_bytes() != old.read_bytes()
             ]
     except StudyError as error:

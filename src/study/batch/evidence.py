@@ -27,12 +27,21 @@ from study.methods import METHODS
 from study.methods.skeleton_graph import SkeletonGraphMethod
 from study.params import find_profile
 from study.results.claim import PROVENANCE, claimed
+from study.results.evidence import (
+    PEOPLE,
+    ROBUSTNESS,
+    SENSITIVITY,
+    Evidence,
+    evidence_folder,
+    find_evidence,
+    pairs_table,
+)
 from study.results.journal import Journal
 from study.results.provenance import arithmetic, provenance
 from study.results.run import Run
+from study.results.verdicts import write_claims
 from study.skeleton.som import SomParams
 
-ROBUSTNESS, SENSITIVITY = "robustness", "sensitivity"
 Rows = list[dict[str, Any]]
 
 
@@ -50,6 +59,7 @@ class EvidencePlan:
         method_seeds: of the graph's draws, for each choice.
         graph: whose choices.
         choices: those that are tried; all when empty.
+        datasets: of more people; those that the manifest calls evidence when None.
     """
 
     base: Disturbance = field(default_factory=Disturbance)
@@ -61,6 +71,7 @@ class EvidencePlan:
     method_seeds: tuple[int, ...] = (0, 1)
     graph: SkeletonGraphMethod = field(default_factory=SkeletonGraphMethod)
     choices: tuple[str, ...] = ()
+    datasets: tuple[str, ...] | None = None
 
     def levels(self) -> list[Level]:
         """The levels that are run."""
@@ -102,6 +113,7 @@ PLANS: Mapping[str, EvidencePlan] = MappingProxyType(
                 "parts of a cartilage (waypoints)",
                 "rectangle of the sternum (coarse)",
             ),
+            datasets=("population",),  # the others need files
         ),
     }
 )
@@ -134,7 +146,7 @@ def run_evidence(
     A run that is stopped, however, goes on when it is started again, case by case.
 
     Args:
-        out: holds ``robustness``, ``sensitivity`` and a folder for each data set that the manifest calls evidence.
+        out: holds ``robustness``, ``sensitivity``, a folder for each data set, and ``people``, small tables of those.
         profile: ``"full"`` or ``"quick"``.
         plan: how much of robustness and sensitivity; the profile's when None.
         n_jobs: worker processes.
@@ -150,12 +162,44 @@ def run_evidence(
     plan = plan or PLANS[profile]
     workers = Workers(n_jobs, show_progress)
     folders = [_run_part(part, out / part.name, workers) for part in (_robustness(plan), _sensitivity(plan))]
-    for name in datasets_for_evidence():
+    runs = []
+    for name in datasets_for_evidence() if plan.datasets is None else plan.datasets:
         dataset, folder = find_dataset(name, params), out / name
         if why_stale(Run(folder), dataset) is not None:
             run_study(dataset, folder, n_jobs=n_jobs, show_progress=show_progress)
-        folders.append(folder)
-    return folders
+        runs.append(Run(folder))
+    return [*folders, *(run.folder for run in runs), *([_people(runs, out / PEOPLE)] if runs else [])]
+
+
+def open_evidence(profile: str = "full") -> Evidence:
+    """What `make evidence` left, or what is committed of it; of the quick profile, run now where it is not of now.
+
+    Raises:
+        StudyError: neither is there for the full profile, which takes an hour and is not run unasked.
+    """
+    if profile != "full":
+        run_evidence(evidence_folder(profile), profile=profile)
+    found = find_evidence(profile)
+    if found is None:
+        raise StudyError(f"expected evidence at {evidence_folder(profile)}, got none; run `make evidence`")
+    return found
+
+
+def _people(runs: list[Run], folder: Path) -> Path:
+    """The small tables of runs of more people."""
+    started = datetime.now(UTC)
+    with claimed(folder) as claim:
+        new = claim.new()
+        pairs = pairs_table(runs)
+        write_text(new / "pairs.csv", pairs.to_csv(index=False, lineterminator="\n", float_format="%.4f"))
+        write_claims(runs, new)
+        record = provenance(
+            PEOPLE, {run.dataset: dict(run.provenance) for run in runs}, 0, {}, started, datetime.now(UTC)
+        )
+        hashes = {path.name: sha256_of(path) for path in new.iterdir()}
+        write_json({**record, "files_sha256": hashes}, new / PROVENANCE)
+        claim.swap_in()
+    return folder
 
 
 def _robustness(plan: EvidencePlan) -> _Part:

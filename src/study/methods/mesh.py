@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import gc
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import open3d as o3d
@@ -91,18 +93,31 @@ def amberg(
     Returns:
         vertices (v, 3) before and after every iteration.
     """
-    records: list[Floats] = trimesh.registration.nricp_amberg(
-        trimesh.Trimesh(vertices, faces, process=False),
-        trimesh.PointCloud(target),
-        steps=steps,
-        eps=eps,
-        gamma=gamma,
-        distance_threshold=distance_threshold,
-        use_faces=False,  # the target is points
-        neighbors_count=neighbors_count,
-        return_records=True,
-    )
+    with _no_collection():
+        records: list[Floats] = trimesh.registration.nricp_amberg(
+            trimesh.Trimesh(vertices, faces, process=False),
+            trimesh.PointCloud(target),
+            steps=steps,
+            eps=eps,
+            gamma=gamma,
+            distance_threshold=distance_threshold,
+            use_faces=False,  # the target is points
+            neighbors_count=neighbors_count,
+            return_records=True,
+        )
     return records
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """trimesh makes a list a row of its equations; looking for rubbish among them is two thirds of its time."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def carry(displacements: Floats, vertices: Floats, faces: Ints, points: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +15,7 @@ from study.errors import StudyError
 from study.evaluation.claim_questions import UNTESTABLE
 from study.evaluation.claims import CLAIMS, UNKNOWN, claims_table, with_minutes
 from study.files.atomic import json_text, write_text
+from study.files.places import CHECKOUT
 from study.methods import METHODS
 from study.params import PROFILES
 from study.results.run import Run
@@ -103,13 +105,31 @@ def claims_markdown(runs: Sequence[Run]) -> str:
     )
 
 
-def write_claims(runs: Sequence[Run], out: Path) -> tuple[Path, Path]:
+def write_claims(runs: Sequence[Run], out: Path, more: Path | None = None) -> tuple[Path, Path]:
     """Write ``claims.csv`` and ``claims.md`` into a folder; their paths.
+
+    Args:
+        runs: see `claim_rows`.
+        out: the folder.
+        more: a folder with the claims against other runs, whose rows ``claims.csv`` has, too, and whose page the page
+            names; None, or one that is not there, for none.
 
     Raises:
         StudyError: see `claim_rows`.
     """
     table, page = out / "claims.csv", out / "claims.md"
-    write_text(table, claim_rows(runs).to_csv(index=False, lineterminator="\n"))
-    write_text(page, claims_markdown(runs))
+    rows, text = claim_rows(runs), claims_markdown(runs)
+    if more is not None and (more / table.name).is_file():
+        rows = _joined(rows, pd.read_csv(more / table.name, encoding="utf-8"))
+        where = Path(os.path.relpath(more / page.name, CHECKOUT / "results")).as_posix()
+        text += f"\nThe same against more people, sweeps and planted deformations: [{where}]({where}).\n"
+    write_text(table, rows.to_csv(index=False, lineterminator="\n"))
+    write_text(page, text)
     return table, page
+
+
+def _joined(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
+    """Rows of claims of several runs, claim by claim; what no run can test stays one row."""
+    both = pd.concat([rows, others[others["dataset"] != "-"]], ignore_index=True)
+    order = {claim.text: number for number, claim in enumerate(CLAIMS)}
+    return both.iloc[both["claim"].map(order).argsort(kind="stable")]
