@@ -60,6 +60,7 @@ class EvidencePlan:
         graph: whose choices.
         choices: those that are tried; all when empty.
         datasets: of more people; those that the manifest calls evidence when None.
+        compared: methods that are run on them; all when None.
     """
 
     base: Disturbance = field(default_factory=Disturbance)
@@ -72,6 +73,7 @@ class EvidencePlan:
     graph: SkeletonGraphMethod = field(default_factory=SkeletonGraphMethod)
     choices: tuple[str, ...] = ()
     datasets: tuple[str, ...] | None = None
+    compared: tuple[str, ...] | None = None
 
     def levels(self) -> list[Level]:
         """The levels that are run."""
@@ -114,6 +116,7 @@ PLANS: Mapping[str, EvidencePlan] = MappingProxyType(
                 "rectangle of the sternum (coarse)",
             ),
             datasets=("population",),  # the others need files
+            compared=("coarse", "icp", "cpd", "skeleton_graph", "cpd_tuned", "cpd_tuned_whole"),
         ),
     }
 )
@@ -165,8 +168,8 @@ def run_evidence(
     runs = []
     for name in datasets_for_evidence() if plan.datasets is None else plan.datasets:
         dataset, folder = find_dataset(name, params), out / name
-        if why_stale(Run(folder), dataset) is not None:
-            run_study(dataset, folder, n_jobs=n_jobs, show_progress=show_progress)
+        if why_stale(Run(folder), dataset, plan.compared) is not None:
+            run_study(dataset, folder, methods=plan.compared, n_jobs=n_jobs, show_progress=show_progress)
         runs.append(Run(folder))
     return [*folders, *(run.folder for run in runs), *([_people(runs, out / PEOPLE)] if runs else [])]
 

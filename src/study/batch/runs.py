@@ -126,12 +126,12 @@ def run_parameters(dataset: Dataset, methods: Iterable[str] | None = None) -> di
     return {"study": asdict(dataset.params), "methods": {name: asdict(METHODS[name]) for name in chosen}}
 
 
-def why_stale(run: Run, dataset: Dataset) -> str | None:
-    """Why a run cannot stand for one of every method made now, see `Run.why_stale`; None when it can."""
+def why_stale(run: Run, dataset: Dataset, methods: Iterable[str] | None = None) -> str | None:
+    """Why a run cannot stand for one of ``methods`` (all when None) made now, see `Run.why_stale`; None when it can."""
     inputs = {dataset.manifest.path.name: sha256_of(dataset.manifest.path)}
     for name in dict.fromkeys(dataset.origin(name) or name for name in dataset.names()):
         inputs |= input_hashes(dataset, name)
-    return run.why_stale(dataset.name, run_parameters(dataset), dataset.seed, inputs)
+    return run.why_stale(dataset.name, run_parameters(dataset, methods), dataset.seed, inputs)
 
 
 def open_run(dataset: str, profile: str = "full", seed: int = 0, *, show_progress: bool = False) -> Run:

@@ -33,7 +33,14 @@ from study.evaluation.distances import (
     sampling_floor_mm,
     waypoint_errors_mm,
 )
-from study.evaluation.intervals import Interval, difference_intervals, mean_intervals, over_people, paired_intervals
+from study.evaluation.intervals import (
+    Interval,
+    difference_intervals,
+    interval_text,
+    mean_intervals,
+    over_people,
+    paired_intervals,
+)
 from study.evaluation.judgement import Judgement
 from study.evaluation.metrics import METRICS, Metric, Unit, judge
 from study.evaluation.pair import TRUTH, Pair, align_pair, in_order, perfect
@@ -79,6 +86,7 @@ __all__ = [
     "hausdorff_mm",
     "in_order",
     "intercostal_waypoints",
+    "interval_text",
     "judge",
     "mean_intervals",
     "options",

@@ -180,6 +180,12 @@ def difference_intervals(per_pair: pd.DataFrame, reference: str, resolution: flo
     return _as_table(found).assign(is_tie=[interval.is_tie(resolution) for interval in found.values()])
 
 
+def interval_text(row: pd.Series, digits: int = 2) -> str:
+    """A row of `mean_intervals` or `difference_intervals` as ``"2.13 [1.90, 2.41]"``; unknown ends stay out."""
+    ends = "" if pd.isna(row["low"]) else f" [{row['low']:.{digits}f}, {row['high']:.{digits}f}]"
+    return f"{row['value']:.{digits}f}{ends}"
+
+
 def _as_table(found: Mapping[str, Interval]) -> pd.DataFrame:
     columns = ("value", "low", "high", "n_pairs", "n_people", "is_rough")
     rows = [[getattr(interval, name) for name in columns] for interval in found.values()]
