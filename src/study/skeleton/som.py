@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from study.errors import StudyError
@@ -102,8 +103,11 @@ def neighbourhood(hops: Ints, radius: float) -> Floats:
 
 
 @njit(cache=True)
-def _epoch(nodes, points, classes, barred, theta, rate):  # type: ignore[no-untyped-def]
-    """One epoch of Eq. 2 in place: nodes (3, m), points (k, 3) with classes (k,) into barred (c, m), theta (m, m)."""
+def _epoch(nodes, points, classes, barred, first, near, theta, rate):  # type: ignore[no-untyped-def]
+    """One epoch of Eq. 2 in place: nodes (3, m), points (k, 3) with classes (k,) into barred (c, m).
+
+    Winner w pulls the nodes ``near[first[w] : first[w + 1]]`` by ``theta`` of the same rows: theta is 0 elsewhere.
+    """
     # Nodes lie as (3, m): one coordinate after the other lets the compiler take several nodes at a time.
     m = nodes.shape[1]
     x, y, z = nodes[0], nodes[1], nodes[2]
@@ -117,9 +121,8 @@ def _epoch(nodes, points, classes, barred, theta, rate):  # type: ignore[no-unty
         for s in range(1, m):
             if apart[s] < apart[winner]:
                 winner = s
-        pull = theta[winner]
-        for s in range(m):  # Eq. 2
-            step = pull[s] * rate
+        for j in range(first[winner], first[winner + 1]):  # Eq. 2
+            s, step = near[j], theta[j] * rate
             x[s] += step * (px - x[s])
             y[s] += step * (py - y[s])
             z[s] += step * (pz - z[s])
@@ -154,9 +157,10 @@ def fit_som(
             hops, radius = graph.hops(directed=False), np.nan
         if params.radius_at(epoch) != radius:
             radius = params.radius_at(epoch)
-            theta = neighbourhood(hops, radius)
+            theta = csr_array(neighbourhood(hops, radius))
         drawn = rng.integers(len(points), size=params.samples)
-        _epoch(nodes, points[drawn], classes[drawn], barred, theta, params.rate_at(epoch))
+        pull = theta.indptr, theta.indices, theta.data
+        _epoch(nodes, points[drawn], classes[drawn], barred, *pull, params.rate_at(epoch))
         if epoch >= 0 and (epoch % max(1, params.epochs // N_CHECKS) == 0 or epoch == params.epochs - 1):
             history.append(quantisation_error_mm(nodes.T, points))
     return graph.with_nodes(nodes.T), tuple(history)
