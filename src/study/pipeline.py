@@ -19,7 +19,6 @@ from study.geometry.points import nearest, principal_axes, unit
 # batch, loads them before: a limit of threads holds only for the pools that are there when it is set, and Open3D brings
 # one; nor does the clock measure an import.
 from study.methods import METHODS, drift, mesh  # noqa: F401
-from study.methods.visible_surface import carry
 from study.quality import QUALITY_LIMITS, SWAPPED, measure_quality, quality_warnings
 from study.registration import Method, Registration
 from study.seeds import named_rng
@@ -90,7 +89,7 @@ def register_pair(
     result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
     if len(alignment.source.cloud) == len(given):
         return result
-    return replace(result, source=given.points, warped=carry(given.points, result.source, result.warped, CARRIERS))
+    return replace(result, source=given.points, warped=result.carry(given.points, CARRIERS))
 
 
 def _as_cloud(given: ArrayLike | PointCloud | SweepCloud, name: str, front: ArrayLike | None = None) -> PointCloud:

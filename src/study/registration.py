@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from study import preview
 from study.errors import StudyError
-from study.geometry.points import fit_rigid
+from study.geometry.points import fit_rigid, fit_rigid_batch, nearest
 from study.quality import Quality
 from study.types import Floats, PointCloud, RigidTransform, as_points
 
@@ -45,20 +45,12 @@ def carry_path(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, ra
     Raises:
         StudyError: clouds that do not pair, a radius that is none, or waypoints in metres.
     """
-    waypoints = as_points(waypoints, "waypoints")
+    waypoints = _as_path(waypoints, radius_mm)
     source, warped = as_points(source, "source"), as_points(warped, "warped")
     if source.shape != warped.shape:
         raise StudyError(
             f"expected one warped point per source point, got {source.shape} and {warped.shape}; "
             "pass both clouds of one registration"
-        )
-    if not 0 < radius_mm < np.inf:
-        raise StudyError(f"expected radius_mm > 0, got {radius_mm}; the paper's is 20")
-    extent = float(np.linalg.norm(np.ptp(waypoints, axis=0)))
-    if 0 < extent < MIN_PATH_MM:
-        raise StudyError(
-            f"waypoints: expected a path in millimetres, got {len(waypoints)} points {extent:.2g} mm across; metres? "
-            "multiply by 1000"
         )
     moved, reasons = np.full_like(waypoints, np.nan), []
     for k, members in enumerate(KDTree(source).query_ball_point(waypoints, radius_mm)):
@@ -90,7 +82,33 @@ def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radi
         >>> transfer(wall, wall * [1.02, 1, 1] + [0, 5, 0], [[50, -10, 20]]).round(1)
         array([[51., -5., 20.]])
     """
-    path = carry_path(source, warped, waypoints, radius_mm=radius_mm)
+    return _all_good(carry_path(source, warped, waypoints, radius_mm=radius_mm))
+
+
+def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Floats:
+    """Move each of ``points`` (k, 3) by the rigid motion of its nearest ``source`` (n, 3) to ``warped`` (n, 3)."""
+    _, index = KDTree(source).query(points, k=neighbours)
+    weights = np.full(index.shape, 1 / neighbours)
+    rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
+    carried: Floats = np.einsum("nij,nj->ni", rotations, points) + translations
+    return carried
+
+
+def _as_path(waypoints: ArrayLike, radius_mm: float) -> Floats:
+    """Waypoints (k, 3) mm, checked, with the radius that goes with them."""
+    waypoints = as_points(waypoints, "waypoints")
+    if not 0 < radius_mm < np.inf:
+        raise StudyError(f"expected radius_mm > 0, got {radius_mm}; the paper's is 20")
+    extent = float(np.linalg.norm(np.ptp(waypoints, axis=0)))
+    if 0 < extent < MIN_PATH_MM:
+        raise StudyError(
+            f"waypoints: expected a path in millimetres, got {len(waypoints)} points {extent:.2g} mm across; metres? "
+            "multiply by 1000"
+        )
+    return waypoints
+
+
+def _all_good(path: CarriedPath) -> Floats:
     for number, reason in enumerate(path.reasons):
         if reason:
             raise StudyError(f"expected waypoints that can all be carried, got waypoint {number}: {reason}")
@@ -144,12 +162,24 @@ class Registration:
     quality: Quality | None = None
 
     def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
-        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits (sec. III-D).
+        """Waypoints (k, 3) mm from the CT frame into the US frame, all of them good (sec. III-D).
 
         Raises:
-            StudyError: fewer than 3 cloud points within ``radius_mm`` of a waypoint.
+            StudyError: what `carry_path` refuses, or a waypoint that cannot be carried.
         """
-        return transfer(self.source, self.warped, waypoints, radius_mm=radius_mm)
+        return _all_good(self.carry_path(waypoints, radius_mm))
+
+    def carry_path(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> CarriedPath:
+        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits, a bad one for itself.
+
+        Raises:
+            StudyError: as the function of that name.
+        """
+        return carry_path(self.source, self.warped, waypoints, radius_mm=radius_mm)
+
+    def carry(self, points: Floats, neighbours: int) -> Floats:
+        """Other CT points (k, 3) mm in the US frame, each by the rigid motion of its ``neighbours`` in the cloud."""
+        return carry(points, self.source, self.warped, neighbours)
 
     def _repr_html_(self) -> str:
         """A few lines, and the warped cloud coloured by how far each point left the rigid part."""
@@ -164,6 +194,53 @@ class Registration:
             "colour": f"distance from the rigid part, 0 to {bent_mm.max():.1f} mm",
         }
         return preview.card(f"Registration: {self.method or 'unnamed'}", lines, preview.by_size(self.warped, bent_mm))
+
+
+class Field(Protocol):
+    """A map of space, known anywhere."""
+
+    def apply(self, points: Floats) -> Floats:
+        """Where points (k, 3) mm of the US frame come to lie in it."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldRegistration(Registration):
+    """A registration that knows where any place goes, not its points only; its waypoints need no local fits.
+
+    Attributes:
+        field: takes the CT after ``T_us_ct`` to its places in the US frame; ``warped`` is what it makes of ``source``.
+    """
+
+    field: Field
+
+    def carry_path(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> CarriedPath:
+        """Waypoints (k, 3) mm from the CT frame into the US frame by the field, a bad one for itself.
+
+        A field has a value anywhere; far from the cloud it means nothing.
+
+        Args:
+            waypoints: (k, 3) mm, CT.
+            radius_mm: within which a waypoint needs a point of the cloud.
+
+        Raises:
+            StudyError: a radius that is none, or waypoints in metres.
+        """
+        waypoints = _as_path(waypoints, radius_mm)
+        distances, _ = nearest(waypoints, self.source)
+        reasons = tuple(
+            f"expected a CT point within {radius_mm:g} mm, got the nearest at {distance:.0f} mm; "
+            "check that it lies between the cartilages, or raise the radius"
+            if distance > radius_mm
+            else ""
+            for distance in distances
+        )
+        good = (distances <= radius_mm)[:, None]
+        return CarriedPath(np.where(good, self.carry(waypoints), np.nan), reasons)
+
+    def carry(self, points: Floats, neighbours: int = 0) -> Floats:
+        """Other CT points (k, 3) mm in the US frame by the field; ``neighbours`` play no part."""
+        return self.field.apply(self.T_us_ct.apply(points))
 
 
 @runtime_checkable

@@ -7,11 +7,12 @@ and whole, the paper's comparison; ``_tuned`` is tuned and visible; the names of
     >>> [name for name in METHODS if name.startswith("icp")]
     ['icp', 'icp_tuned', 'icp_visible', 'icp_tuned_whole']
 
-The coarse alignment has neither, and the skeleton graph one row more, with every choice of its authors' code:
+The coarse alignment has neither, and the skeleton graph two rows more: every choice of its authors' code, and the same
+idea with its weak steps mended:
 
     >>> [name for name in METHODS if name.startswith(("coarse", "skeleton"))]
     ['coarse', 'skeleton_graph', 'skeleton_graph_tuned', 'skeleton_graph_authors', 'skeleton_graph_visible', \
-'skeleton_graph_tuned_whole']
+'skeleton_graph_tuned_whole', 'skeleton_graph_repaired']
 
 A method is a frozen dataclass of its parameters, and another setting is another value:
 
@@ -31,6 +32,7 @@ from study.methods.cpd import Cpd
 from study.methods.icp import Icp
 from study.methods.nonrigid_icp import NonrigidIcp
 from study.methods.skeleton_graph import SkeletonGraphMethod, SkeletonRegistration
+from study.methods.skeleton_graph_repaired import RepairedRegistration, SkeletonGraphRepaired
 from study.methods.visible_surface import VisibleSurface
 from study.registration import Method
 
@@ -40,7 +42,9 @@ __all__ = [
     "Cpd",
     "Icp",
     "NonrigidIcp",
+    "RepairedRegistration",
     "SkeletonGraphMethod",
+    "SkeletonGraphRepaired",
     "SkeletonRegistration",
     "VisibleSurface",
 ]
@@ -66,5 +70,6 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "nonrigid_icp_tuned_whole": NonrigidIcp.tuned_whole(),
         "cpd_tuned_whole": Cpd.tuned_whole(),
         "skeleton_graph_tuned_whole": SkeletonGraphMethod.tuned_whole(),
+        "skeleton_graph_repaired": VisibleSurface(SkeletonGraphRepaired()),
     }
 )
