@@ -43,7 +43,8 @@ class SweepCloud:
     """The cloud of a sweep, and what the sweep knows beyond its points.
 
     Attributes:
-        cloud: points (n, 3) mm in the base frame, and when each was seen, (n,) s on the poses' clock; no parts.
+        cloud: points (n, 3) mm in the base frame, and when each was seen, (n,) s on the poses' clock; no parts. A point
+            where two lines overlap is the mean of both, and so is its time.
         beam: (3,) unit vector, the mean direction in which the beams looked, base frame.
         report: frames used and dropped.
     """
