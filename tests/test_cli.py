@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,10 +25,11 @@ from phantom_files import SMALL, cached_ct_volume, landmark_file, nifti, own_man
 from scipy.spatial import KDTree
 
 from study import params as study_params
-from study import phantom
+from study import phantom, pipeline
 from study.cli import main
 from study.ct.parts import parts_from_labels
 from study.datasets import for_evidence
+from study.errors import StudyError
 from study.files.atomic import sha256_of
 from study.files.clouds import read_ply, write_ply
 from study.methods import METHODS
@@ -217,6 +219,23 @@ def test_two_clouds_are_registered_and_written(clouds: Path, tmp_path: Path, cap
     waypoints = np.loadtxt(clouds / "way.csv", delimiter=",", skiprows=1)
     moved = np.loadtxt(tmp_path / "out" / "waypoints_us.csv", delimiter=",", skiprows=1)
     assert np.allclose(waypoints @ T[:3, :3].T + T[:3, 3], moved, atol=1e-6)
+
+
+def test_a_clouds_times_come_with_its_file(
+    clouds: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    us, handed = read_ply(clouds / "us.ply"), []
+    write_ply(PointCloud(us, times=np.arange(len(us)) / 100), tmp_path / "timed.ply")
+
+    def register(*given: Any, **options: Any) -> Any:
+        handed.append(options["times"])
+        raise StudyError("expected nothing")
+
+    monkeypatch.setattr(pipeline, "register_pair", register)
+    for name in (tmp_path / "timed.ply", clouds / "us.ply"):
+        refused(capsys, "register", clouds / "ct.ply", name, "--out", "out")
+    assert np.array_equal(handed[0], np.arange(len(us)) / 100)
+    assert handed[1] is None
 
 
 def test_the_default_method_keeps_the_rows(clouds: Path, tmp_path: Path, capsys: Capture) -> None:

@@ -22,7 +22,7 @@ from study.pipeline import find_method, register_aligned, run_method
 from study.registration import Registration, transfer
 from study.seeds import named_rng
 from study.types import PointCloud, RigidTransform
-from study.ultrasound.cloud import sweep_cloud
+from study.ultrasound.cloud import sweep_cloud, thin_evenly
 
 
 def test_the_front_door_holds_what_others_rely_on():
@@ -223,6 +223,53 @@ def test_every_given_point_has_its_row_however_many_there_are():
         truth = phantom.truth_map(*people, ct)
         errors.append(np.linalg.norm(pair.warped - truth, axis=1).mean())
     assert errors[0] == pytest.approx(errors[1], abs=1.0)
+
+
+@dataclass(frozen=True)
+class Spy:
+    """Keeps what a method is given."""
+
+    name: ClassVar[str] = "spy"
+    seen: list[PointCloud]
+
+    def register(self, source, target, rng):
+        self.seen.append(target)
+        return CoarseOnly().register(source, target, rng)
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_times_reach_the_method_in_step_with_their_points(ct_clouds, us_cloud, monkeypatch, dense):
+    ct, us = ct_clouds["ct1"].points, us_cloud.points
+    rng = np.random.default_rng(8)
+    # Even already; or so dense that both thinnings have points to average and to drop.
+    us = np.concatenate([us + rng.normal(scale=0.2, size=us.shape) for _ in range(6)]) if dense else thin_evenly(us, 3)
+    away = RigidTransform.random(np.random.default_rng(3))
+    us = away.apply(us)
+    slope = np.array([0.1, -0.2, 0.3])
+    times = us @ slope + 5  # what is linear in place stays so however points are averaged
+    seen = []
+    monkeypatch.setattr(study.pipeline, "METHODS", {"spy": Spy(seen)})
+    register_pair(ct, us, "spy", times=times)
+    register_pair(ct, PointCloud(us, times=times), "spy")
+    register_pair(ct, PointCloud(us, times=times + 1), "spy", times=times)  # what is given says it again
+    register_pair(ct, us, "spy")
+    given, own, again, without = seen
+    assert (len(given) < len(us)) == dense
+    np.testing.assert_allclose(given.times, given.points @ slope + 5, atol=1e-6)
+    for other in (own, again):
+        assert np.array_equal(other.times, given.times)
+    assert without.times is None
+    assert without.points.tobytes() == given.points.tobytes()  # times move no point
+    assert np.array_equal(without.parts, given.parts)
+
+
+@pytest.mark.parametrize("bad", [[1.0], np.zeros((3000, 1)), np.full(3000, np.nan), ["late"] * 3000])
+def test_times_that_are_not_one_a_point_are_refused(ct_clouds, us_cloud, bad):
+    us = us_cloud.points
+    if len(bad) == 3000:
+        bad = bad[: len(us)]
+    with pytest.raises(StudyError, match=r"us: expected (one time per point|finite times|a time in seconds)"):
+        register_pair(ct_clouds["ct1"].points, us, "coarse", times=bad)
 
 
 def test_a_rigid_answer_stays_rigid_on_points_that_were_thinned(ct_clouds, us_cloud):

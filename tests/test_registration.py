@@ -108,18 +108,15 @@ def test_a_field_says_nothing_far_from_the_cloud():
     result = bent_wall(RigidTransform())
     path = result.carry_path(waypoints)
     assert path.reasons[:2] == ("", "")
-    assert "expected a CT point within 20 mm, got the nearest at 195 mm" in path.reasons[2]
+    assert "expected CT points within 50 mm, got none within 195" in path.reasons[2]
     assert np.isnan(path.points[2]).all()
     assert np.isfinite(path.points[:2]).all()
-    with pytest.raises(StudyError, match="waypoint 2: expected a CT point within 20 mm"):
-        result.transfer(waypoints)
-    assert np.isfinite(result.transfer(waypoints, radius_mm=300.0)).all()
+    with pytest.raises(StudyError, match="waypoint 2: expected CT points within 50 mm"):
+        result.transfer(waypoints, radius_mm=300.0)
 
 
 def test_waypoints_for_a_field_are_checked_like_those_for_a_sphere():
     result = bent_wall(RigidTransform())
-    with pytest.raises(StudyError, match="expected radius_mm > 0"):
-        result.transfer(WAYPOINTS, radius_mm=0.0)
     with pytest.raises(StudyError, match="expected a path in millimetres"):
         result.transfer(WAYPOINTS / 1000)
     with pytest.raises(StudyError, match="expected finite"):

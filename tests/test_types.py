@@ -1,5 +1,7 @@
 """The nouns check what they hold and cannot be changed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,43 @@ def test_a_cloud_refuses_other_units_few_points_and_wrong_labels():
         PointCloud(BOX, parts=np.zeros(199, dtype=np.int64))
     with pytest.raises(StudyError, match="expected labelled parts, got none; label it"):
         PointCloud(BOX).only(Part.STERNUM)
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (np.zeros(199), r"box: expected one time per point \(200,\), got \(199,\)"),
+        (np.zeros((200, 1)), r"expected one time per point \(200,\), got \(200, 1\)"),
+        (1.0, r"expected one time per point \(200,\), got \(\)"),
+        (["soon"] * 200, "expected a time in seconds per point, got no numbers"),
+        (np.where(np.arange(200) == 7, np.nan, 0.0), "expected finite times in seconds, got 1 .* the first 7"),
+    ],
+)
+def test_a_cloud_refuses_times_that_are_none(times, message):
+    with pytest.raises(StudyError, match=message):
+        PointCloud(BOX, "box", times=times)
+
+
+def test_times_are_a_copy_that_follows_the_points():
+    mine = np.arange(200.0)
+    cloud = PointCloud(BOX, times=mine, parts=np.arange(200) % 3)
+    mine[0] = 99
+    assert cloud.times[0] == 0
+    assert not cloud.times.flags.writeable
+    moved = cloud.moved(RigidTransform.random(np.random.default_rng(1)))
+    assert np.array_equal(moved.times, cloud.times)
+    for rows in (np.arange(100)[::-1], np.arange(200) > 60):
+        some = cloud.subset(rows)
+        assert np.array_equal(some.points, BOX[rows])
+        assert np.array_equal(some.times, cloud.times[rows])
+        assert np.array_equal(some.parts, cloud.parts[rows])
+    assert PointCloud(BOX).subset(np.arange(60)).times is None
+
+
+def test_points_without_their_times_are_refused():
+    cloud = PointCloud(BOX, times=np.arange(200.0))
+    with pytest.raises(StudyError, match=r"expected one time per point \(150,\), got \(200,\)"):
+        replace(cloud, points=BOX[:150])
 
 
 def test_a_cloud_hands_out_its_parts_and_moves():

@@ -226,7 +226,12 @@ def compare(reference: Path, candidate: Path) -> None:
 @cli.command(short_help="Register two clouds of one's own.")
 @click.argument("ct", type=click.Path(path_type=Path))
 @click.argument("us", type=click.Path(path_type=Path))
-@click.option("--method", default="skeleton_graph", show_default=True)
+@click.option(
+    "--method",
+    default="skeleton_graph",
+    show_default=True,
+    help="A name in METHODS; the default is the paper's, gaussian_process has the smallest true error.",
+)
 @click.option("--waypoints", type=click.Path(path_type=Path), help="CSV with columns x, y, z: mm in the CT frame.")
 @click.option(
     "--radius",
@@ -242,14 +247,18 @@ def compare(reference: Path, candidate: Path) -> None:
 def register(
     ct: Path, us: Path, method: str, waypoints: Path | None, radius: float, front: str | None, seed: int, out: Path
 ) -> None:
-    """Register two clouds of one's own (PLY, mm, any rigid pose): sternum and cartilages 2-5, nothing else."""
-    from study.files.clouds import NOT_CARRIED, read_ply, read_waypoints, write_registration
+    """Register two clouds of one's own (PLY, mm, any rigid pose): sternum and cartilages 2-5, nothing else.
+
+    A property "time" of US's vertices says when each was seen, in seconds; methods that know of breathing use it.
+    """
+    from study.files.clouds import NOT_CARRIED, read_ply, read_timed_ply, read_waypoints, write_registration
     from study.pipeline import find_method, register_pair
 
     find_method(method)
     path = None if waypoints is None else read_waypoints(waypoints)
     towards = None if front is None else _direction(front)
-    result = register_pair(read_ply(ct), read_ply(us), method=method, seed=seed, front=towards)
+    person, (seen, times) = read_ply(ct), read_timed_ply(us)
+    result = register_pair(person, seen, method=method, seed=seed, front=towards, times=times)
     for line in write_registration(result, out, path, radius):
         if line.startswith(NOT_CARRIED):
             click.echo(f"study: warning: {line}", err=True)

@@ -22,7 +22,7 @@ from study.methods import METHODS, drift, mesh  # noqa: F401
 from study.quality import QUALITY_LIMITS, SWAPPED, measure_quality, quality_warnings
 from study.registration import Method, Registration
 from study.seeds import named_rng
-from study.types import Floats, PointCloud, as_points
+from study.types import Floats, PointCloud, as_points, as_times
 from study.ultrasound.cloud import SweepCloud, thin_evenly
 
 FINE_MM = 1.5  # spacing of the points in which the chest is found
@@ -48,6 +48,7 @@ def register_pair(
     method: str = "skeleton_graph",
     seed: int = 0,
     front: ArrayLike | None = None,
+    times: ArrayLike | None = None,
 ) -> Registration:
     """Register a CT cartilage cloud to a US cartilage cloud (sec. III).
 
@@ -56,10 +57,12 @@ def register_pair(
     Args:
         ct: (n, 3) mm, sternum and cartilages 2-5 of both sides, any rigid pose.
         us: (m, 3) mm, the same anatomy as ultrasound sees it, any rigid pose.
-        method: a name in ``METHODS``.
+        method: a name in ``METHODS``; the default is the paper's, `study.BEST_METHOD` has the smallest true error.
         seed: draws of the method.
         front: (3,) direction from the chest to the probe in the US frame, where it is known; a swept cloud's own when
             None. Branches that arch the other way are refused.
+        times: (m,) s, when each US point was seen, on any one clock; a cloud's own when None. What a method makes of
+            them is its affair: most ignore them.
 
     Returns:
         the registration: ``warped`` (n, 3) mm in the US cloud's frame, one row per given CT point, ``transfer`` for
@@ -84,7 +87,7 @@ def register_pair(
         (20, 3)
     """
     chosen = find_method(method)
-    given, seen = _as_cloud(ct, "ct"), _as_cloud(us, "us", front)
+    given, seen = _as_cloud(ct, "ct"), _as_cloud(us, "us", front, times)
     alignment = Alignment(_even_chest(given), _even_chest(seen))
     result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
     if len(alignment.source.cloud) == len(given):
@@ -92,13 +95,23 @@ def register_pair(
     return replace(result, source=given.points, warped=result.carry(given.points, CARRIERS))
 
 
-def _as_cloud(given: ArrayLike | PointCloud | SweepCloud, name: str, front: ArrayLike | None = None) -> PointCloud:
+def _as_cloud(
+    given: ArrayLike | PointCloud | SweepCloud,
+    name: str,
+    front: ArrayLike | None = None,
+    times: ArrayLike | None = None,
+) -> PointCloud:
     """An unlabelled cloud of what was given, under the name that messages call it."""
     if isinstance(given, SweepCloud):
         given = replace(given.cloud, front=given.front)
-    known = given.front if isinstance(given, PointCloud) else None
-    points = given.points if isinstance(given, PointCloud) else as_points(given, name)
-    return PointCloud(points, name, front=known if front is None else unit(front, "front"))
+    if not isinstance(given, PointCloud):
+        given = PointCloud(as_points(given, name), name)
+    return PointCloud(
+        given.points,
+        name,
+        front=given.front if front is None else unit(front, "front"),
+        times=given.times if times is None else as_times(times, len(given), name),
+    )
 
 
 def _even_chest(cloud: PointCloud) -> Chest:
@@ -109,27 +122,33 @@ def _even_chest(cloud: PointCloud) -> Chest:
     """
     centre, axes = principal_axes(cloud.points)
     local = (cloud.points - centre) @ axes.T  # so that a moved cloud keeps the same points
-    kept = _evened(local, FINE_MM)
-    chest = find_chest(cloud if len(kept) == len(cloud) else replace(cloud, points=kept @ axes + centre))
-    seen = _evened(local, MIN_SPACING_MM)
+    kept, kept_s = _evened(local, cloud.times, FINE_MM)
+    fine = cloud if len(kept) == len(cloud) else replace(cloud, points=kept @ axes + centre, times=kept_s)
+    chest = find_chest(fine)
+    seen, seen_s = _evened(local, cloud.times, MIN_SPACING_MM)
     if len(seen) in (len(kept), len(cloud)):
         return chest
     _, like = nearest(seen, kept)
     assert chest.cloud.parts is not None
-    return replace(chest, cloud=replace(chest.cloud, points=seen @ axes + centre, parts=chest.cloud.parts[like]))
+    parts = chest.cloud.parts[like]
+    return replace(chest, cloud=replace(chest.cloud, points=seen @ axes + centre, parts=parts, times=seen_s))
 
 
-def _evened(local: Floats, spacing_mm: float) -> Floats:
+def _evened(local: Floats, times: Floats | None, spacing_mm: float) -> tuple[Floats, Floats | None]:
     """Points (k, 3) mm thinned to the spacing that is typical by area, or ``spacing_mm`` where that is more.
 
-    By number, a patch sampled 20 times would be typical of the whole.
+    By number, a patch sampled 20 times would be typical of the whole. Times (k,) s, where there are any, follow.
     """
-    thinned = thin_evenly(local, spacing_mm)
-    spacing, _ = KDTree(thinned).query(thinned, k=[2])
+    rows = local if times is None else np.column_stack([local, times])
+    thinned = thin_evenly(rows, spacing_mm)
+    spacing, _ = KDTree(thinned[:, :3]).query(thinned[:, :3], k=[2])
     ordered = np.sort(spacing[:, 0])
     area = np.cumsum(ordered**2)
     typical_mm = EVEN_SHARE * float(ordered[np.searchsorted(area, area[-1] / 2)])
-    return thin_evenly(local, typical_mm) if typical_mm > spacing_mm else thinned
+    if typical_mm > spacing_mm:
+        thinned = thin_evenly(rows, typical_mm)
+    # A copy, since a product of strided rows may differ in its last bit: times must not move a point.
+    return np.ascontiguousarray(thinned[:, :3]), None if times is None else thinned[:, 3]
 
 
 def register_aligned(

@@ -17,6 +17,7 @@ from study.types import Floats, PointCloud, RigidTransform, as_points
 
 MIN_SUPPORT = 3  # points that hold a rigid motion
 MIN_WIDTH_MM = 1e-6  # second singular value of points that lie on a line but for rounding
+REACH_MM = 50.0  # from the CT points, beyond which a field is a guess
 MIN_PATH_MM = 1.0  # extent of a path; one in metres is a fraction of a millimetre across
 
 
@@ -32,6 +33,33 @@ class CarriedPath:
     points: Floats
     reasons: tuple[str, ...]
 
+    def complete(self) -> Floats:
+        """The points (k, 3) mm, all of them good.
+
+        Raises:
+            StudyError: a waypoint that could not be carried.
+        """
+        for number, reason in enumerate(self.reasons):
+            if reason:
+                raise StudyError(f"expected waypoints that can all be carried, got waypoint {number}: {reason}")
+        return self.points
+
+
+def as_waypoints(waypoints: ArrayLike) -> Floats:
+    """Check and copy waypoints as a read-only (k, 3) float64 array, mm.
+
+    Raises:
+        StudyError: what `study.types.as_points` refuses, or waypoints in metres.
+    """
+    path = as_points(waypoints, "waypoints")
+    extent = float(np.linalg.norm(np.ptp(path, axis=0)))
+    if 0 < extent < MIN_PATH_MM:
+        raise StudyError(
+            f"waypoints: expected a path in millimetres, got {len(path)} points {extent:.2g} mm across; metres? "
+            "multiply by 1000"
+        )
+    return path
+
 
 def carry_path(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radius_mm: float = 20.0) -> CarriedPath:
     """Move each waypoint by the rigid fit of the cloud points around it (sec. III-D), a bad one for itself.
@@ -45,13 +73,15 @@ def carry_path(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, ra
     Raises:
         StudyError: clouds that do not pair, a radius that is none, or waypoints in metres.
     """
-    waypoints = _as_path(waypoints, radius_mm)
+    waypoints = as_waypoints(waypoints)
     source, warped = as_points(source, "source"), as_points(warped, "warped")
     if source.shape != warped.shape:
         raise StudyError(
             f"expected one warped point per source point, got {source.shape} and {warped.shape}; "
             "pass both clouds of one registration"
         )
+    if not 0 < radius_mm < np.inf:
+        raise StudyError(f"expected radius_mm > 0, got {radius_mm}; the paper's is 20")
     moved, reasons = np.full_like(waypoints, np.nan), []
     for k, members in enumerate(KDTree(source).query_ball_point(waypoints, radius_mm)):
         local = source[members]
@@ -82,7 +112,7 @@ def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radi
         >>> transfer(wall, wall * [1.02, 1, 1] + [0, 5, 0], [[50, -10, 20]]).round(1)
         array([[51., -5., 20.]])
     """
-    return _all_good(carry_path(source, warped, waypoints, radius_mm=radius_mm))
+    return carry_path(source, warped, waypoints, radius_mm=radius_mm).complete()
 
 
 def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Floats:
@@ -92,27 +122,6 @@ def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Fl
     rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
     carried: Floats = np.einsum("nij,nj->ni", rotations, points) + translations
     return carried
-
-
-def _as_path(waypoints: ArrayLike, radius_mm: float) -> Floats:
-    """Waypoints (k, 3) mm, checked, with the radius that goes with them."""
-    waypoints = as_points(waypoints, "waypoints")
-    if not 0 < radius_mm < np.inf:
-        raise StudyError(f"expected radius_mm > 0, got {radius_mm}; the paper's is 20")
-    extent = float(np.linalg.norm(np.ptp(waypoints, axis=0)))
-    if 0 < extent < MIN_PATH_MM:
-        raise StudyError(
-            f"waypoints: expected a path in millimetres, got {len(waypoints)} points {extent:.2g} mm across; metres? "
-            "multiply by 1000"
-        )
-    return waypoints
-
-
-def _all_good(path: CarriedPath) -> Floats:
-    for number, reason in enumerate(path.reasons):
-        if reason:
-            raise StudyError(f"expected waypoints that can all be carried, got waypoint {number}: {reason}")
-    return path.points
 
 
 def _on_a_line(points: Floats) -> bool:
@@ -162,23 +171,34 @@ class Registration:
     quality: Quality | None = None
 
     def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
-        """Waypoints (k, 3) mm from the CT frame into the US frame, all of them good (sec. III-D).
+        """`carry_path` of waypoints that must all be good: (k, 3) mm in the US frame.
 
         Raises:
-            StudyError: what `carry_path` refuses, or a waypoint that cannot be carried.
+            StudyError: fewer than 3 cloud points within ``radius_mm`` of a waypoint.
         """
-        return _all_good(self.carry_path(waypoints, radius_mm))
+        return self.carry_path(waypoints, radius_mm).complete()
 
     def carry_path(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> CarriedPath:
-        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits, a bad one for itself.
+        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits (sec. III-D).
 
         Raises:
-            StudyError: as the function of that name.
+            StudyError: as the function `carry_path`.
         """
         return carry_path(self.source, self.warped, waypoints, radius_mm=radius_mm)
 
+    def bounds(self, waypoints: ArrayLike) -> Floats:
+        """How far (k,) mm at most each transferred waypoint lies from its true place, 19 times in 20.
+
+        Raises:
+            StudyError: a method that says nothing of its error, as most do.
+        """
+        raise StudyError(
+            f"{self.method or 'this registration'}: expected a method with bounds, got one without; study.BEST_METHOD "
+            "has them"
+        )
+
     def carry(self, points: Floats, neighbours: int) -> Floats:
-        """Other CT points (k, 3) mm in the US frame, each by the rigid motion of its ``neighbours`` in the cloud."""
+        """Where other places (k, 3) mm of the CT lie in the US frame: each goes along with its nearest CT points."""
         return carry(points, self.source, self.warped, neighbours)
 
     def _repr_html_(self) -> str:
@@ -215,31 +235,23 @@ class FieldRegistration(Registration):
     field: Field
 
     def carry_path(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> CarriedPath:
-        """Waypoints (k, 3) mm from the CT frame into the US frame by the field, a bad one for itself.
-
-        A field has a value anywhere; far from the cloud it means nothing.
-
-        Args:
-            waypoints: (k, 3) mm, CT.
-            radius_mm: within which a waypoint needs a point of the cloud.
+        """Waypoints (k, 3) mm from the CT frame into the US frame by the field itself; ``radius_mm`` plays no part.
 
         Raises:
-            StudyError: a radius that is none, or waypoints in metres.
+            StudyError: waypoints that are none. One far from the CT points, where nothing holds the field, has a
+                reason instead.
         """
-        waypoints = _as_path(waypoints, radius_mm)
-        distances, _ = nearest(waypoints, self.source)
+        path = as_waypoints(waypoints)
+        away, _ = nearest(path, self.source)
+        far = away > REACH_MM
         reasons = tuple(
-            f"expected a CT point within {radius_mm:g} mm, got the nearest at {distance:.0f} mm; "
-            "check that it lies between the cartilages, or raise the radius"
-            if distance > radius_mm
-            else ""
-            for distance in distances
+            f"expected CT points within {REACH_MM:g} mm, got none within {mm:.0f}; check its frame" if bad else ""
+            for mm, bad in zip(away, far, strict=True)
         )
-        good = (distances <= radius_mm)[:, None]
-        return CarriedPath(np.where(good, self.carry(waypoints), np.nan), reasons)
+        return CarriedPath(np.where(far[:, None], np.nan, self.carry(path)), reasons)
 
     def carry(self, points: Floats, neighbours: int = 0) -> Floats:
-        """Other CT points (k, 3) mm in the US frame by the field; ``neighbours`` play no part."""
+        """Where other places (k, 3) mm of the CT lie in the US frame, by the field."""
         return self.field.apply(self.T_us_ct.apply(points))
 
 

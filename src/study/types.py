@@ -84,6 +84,30 @@ def as_points(points: ArrayLike, name: str = "points", *, at_least: int = 1) -> 
     return array
 
 
+def as_times(times: ArrayLike, n_points: int, name: str = "times") -> Floats:
+    """Check and copy the time stamps of ``n_points`` points as a read-only (n_points,) float64 array, s.
+
+    Raises:
+        StudyError: no numbers, another shape, or a value that is not finite.
+    """
+    try:
+        array = np.array(times, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise StudyError(f"{name}: expected a time in seconds per point, got no numbers: {error}") from error
+    if array.shape != (n_points,):
+        raise StudyError(
+            f"{name}: expected one time per point {(n_points,)}, got {array.shape}; drop those of dropped points too"
+        )
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise StudyError(
+            f"{name}: expected finite times in seconds, got {bad.size} with NaN or infinity, the first {bad[0]}; "
+            "drop those points, or all times"
+        )
+    array.flags.writeable = False
+    return array
+
+
 @dataclass(frozen=True)
 class PointCloud:
     """A cloud of surface points of sternum and cartilages.
@@ -93,6 +117,7 @@ class PointCloud:
         name: what the cloud is, for messages: ``"ct:lidc-0001"``.
         parts: (n,) int64 of `Part`, or None before labelling.
         front: (3,) unit vector towards the skin where the cloud knows it (a probe does), else None.
+        times: (n,) s, when each point was seen, on any one clock (a sweep has one); else None.
 
     Raises:
         StudyError: shape, NaN, fewer than 50 points, or an extent that cannot be a chest in millimetres.
@@ -102,6 +127,7 @@ class PointCloud:
     name: str = "cloud"
     parts: Ints | None = None
     front: Floats | None = None
+    times: Floats | None = None
 
     def __post_init__(self) -> None:
         points = as_points(self.points, self.name, at_least=MIN_POINTS)
@@ -122,6 +148,8 @@ class PointCloud:
                 )
             parts.flags.writeable = False
             object.__setattr__(self, "parts", parts)
+        if self.times is not None:
+            object.__setattr__(self, "times", as_times(self.times, len(points), self.name))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -133,6 +161,15 @@ class PointCloud:
                 f"{self.name}: expected labelled parts, got none; label it with study.alignment.find_chest first"
             )
         return self.points[np.isin(self.parts, [int(part) for part in parts])]
+
+    def subset(self, rows: Ints | Bools) -> PointCloud:
+        """The same cloud with only some of its points, by their rows (k,) or a mask (n,); parts and times follow."""
+        return replace(
+            self,
+            points=self.points[rows],
+            parts=None if self.parts is None else self.parts[rows],
+            times=None if self.times is None else self.times[rows],
+        )
 
     def moved(self, transform: RigidTransform) -> PointCloud:
         """The same cloud in another frame."""

@@ -41,6 +41,7 @@ from study.naming import person_of
 from study.params import PHANTOM_SEED, POPULATION_SEED, PROFILES, StudyParams
 from study.seeds import named_rng
 from study.types import PointCloud
+from study.ultrasound.cloud import contour_points
 from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.sweep_errors import SweepErrors
 
@@ -408,6 +409,23 @@ def test_a_patient_is_seen_from_the_front_in_a_frame_of_its_own(one: Anatomy) ->
     assert not np.allclose(other.T_us_ras.matrix, patient.T_us_ras.matrix)
     again = make_patient(one, SMALL)
     assert np.array_equal(again.cloud.points, patient.cloud.points)
+
+
+def test_a_patients_points_know_when_they_were_seen_up_to_the_method(one: Anatomy) -> None:
+    patient = make_patient(one, SMALL)
+    sweep = sweep_over(one, patient.T_us_ras, named_rng(0, f"{one.name}/sweep"))
+    contour, frames, *_ = contour_points(sweep)
+    _, near = KDTree(contour).query(patient.cloud.points)
+    taken_s = sweep.frame_times_s[frames[near]] - sweep.latency_s
+    assert patient.cloud.times is not None
+    assert np.abs(patient.cloud.times - taken_s).max() < 0.15  # of 30 s; a cube of 0.75 mm is crossed in 0.04
+    assert patient.labelled.times is not None
+    assert np.array_equal(patient.labelled.times, patient.cloud.times)
+    pair = find_dataset("phantom", SMALL).pair(one, patient)
+    target = pair.alignment.target.cloud
+    assert target.times is not None
+    assert np.array_equal(target.points, patient.cloud.points)
+    assert np.array_equal(target.times, patient.cloud.times)
 
 
 @pytest.mark.parametrize("errors", [None, SweepErrors.only("calibration"), SweepErrors.none()])

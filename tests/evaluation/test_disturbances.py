@@ -73,6 +73,19 @@ def test_a_branch_loses_its_lateral_end_then_all_of_it():
     assert reach[1] < reach[0] - 5
 
 
+def test_swept_points_and_their_outliers_have_times():
+    swept = us_of(noise_mm=0.0, calibration_mm=1.0)
+    worse = us_of(noise_mm=0.0, calibration_mm=1.0, outlier_share=0.2, strips=4)
+    assert us_of().times is None
+    assert len(worse.times) == len(worse)
+    when = dict(zip(map(tuple, swept.points), swept.times, strict=True))
+    known = [(when[point], time) for point, time in zip(map(tuple, worse.points), worse.times, strict=True)
+             if point in when]  # fmt: skip
+    assert 0.5 * len(swept) < len(known) < len(swept)
+    assert all(mine == theirs for mine, theirs in known)
+    assert swept.times.min() <= worse.times.min() < worse.times.max() <= swept.times.max()
+
+
 def test_a_twin_lies_where_the_person_does():
     twin = disturbed_pair(replace(SMALL, deformation=0.0), SEED)
     np.testing.assert_allclose(twin.goal, twin.waypoints, atol=1e-6)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from study.errors import StudyError
-from study.files.clouds import read_ply, read_waypoints, write_ply, write_registration
+from study.files.clouds import read_ply, read_timed_ply, read_waypoints, write_ply, write_registration
 from study.registration import Registration
 from study.types import PointCloud, RigidTransform, Waypoints
 
@@ -23,10 +23,43 @@ def test_a_cloud_comes_back_bit_for_bit_and_in_order(tmp_path: Path) -> None:
     assert [entry.name for entry in path.parent.iterdir()] == ["cloud.ply"]
 
 
+def test_times_come_back_bit_for_bit_beside_their_points(tmp_path: Path) -> None:
+    times = 1.7e9 + np.random.default_rng(6).uniform(0, 40, len(POINTS))  # as a computer's clock counts
+    path = write_ply(PointCloud(POINTS, times=times), tmp_path / "us.ply")
+    points, read = read_timed_ply(path)
+    assert np.array_equal(points, POINTS)
+    assert read is not None
+    assert np.array_equal(read, times)
+    assert np.array_equal(read_ply(path), POINTS)
+    assert np.array_equal(trimesh.load(path).vertices, POINTS)
+    assert read_timed_ply(write_ply(PointCloud(POINTS), tmp_path / "bare.ply"))[1] is None
+
+
+def timed_ascii(path: Path, times: list[str], kind: str = "double") -> Path:
+    names = "".join(f"property double {axis}\n" for axis in "xyz")
+    rows = "".join(f"{k} {k * k} 3 {time}\n" for k, time in enumerate(times))
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(times)}\n{names}property {kind} time\nend_header\n"
+    path.write_text(header + rows, encoding="utf-8")
+    return path
+
+
+def test_times_of_other_writers_are_read_or_refused(tmp_path: Path) -> None:
+    path = timed_ascii(tmp_path / "us.ply", ["0.5", "0.25", "12"])
+    assert np.array_equal(read_timed_ply(path)[1], [0.5, 0.25, 12])
+    assert np.array_equal(read_timed_ply(timed_ascii(path, ["0.5", "0.25", "12"], "float"))[1], [0.5, 0.25, 12])
+    for bad in ("nan", "inf"):
+        with pytest.raises(StudyError, match=r"us\.ply: expected finite times in seconds, got 1 .* the first 2"):
+            read_timed_ply(timed_ascii(path, ["1", "2", bad]))
+    with pytest.raises(StudyError, match=r"us\.ply: expected times to 0\.05 s or finer, got single precision"):
+        read_timed_ply(timed_ascii(path, ["1700000000.5", "1700000001.5", "1700000002"], "float"))
+    assert len(read_ply(path)) == 3
+
+
 def test_ascii_clouds_and_meshes_are_read_as_they_are(tmp_path: Path) -> None:
     box = trimesh.creation.box((100, 200, 300))
     box.export(tmp_path / "mesh.ply", encoding="ascii")
     assert np.allclose(read_ply(tmp_path / "mesh.ply"), box.vertices)
+    assert read_timed_ply(tmp_path / "mesh.ply")[1] is None
     doubled = "\n".join(["1 2 3", "1 2 3", "4 5 6"])  # equal points stay: row i must stay row i
     header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {a}\n" for a in "xyz")
     (tmp_path / "cloud.ply").write_text(f"{header}end_header\n{doubled}\n")

@@ -11,6 +11,8 @@ from trimesh.creation import box
 from study.errors import StudyError
 from study.geometry.rays import surface_distance_mm
 from study.types import Mesh, RigidTransform
+from study.ultrasound import virtual_sweep
+from study.ultrasound.breathing import quiet_breathing
 from study.ultrasound.cloud import contour_points, sweep_cloud
 from study.ultrasound.probe import Probe
 from study.ultrasound.sweep_errors import ERROR_SOURCES, LATENCY_S, SweepErrors
@@ -33,9 +35,11 @@ def test_without_errors_the_cloud_is_the_visible_surface(chest, record, seen):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_with_every_error_the_cloud_lies_within_1_5_mm(mean_error_mm, seed):
+def test_with_every_error_the_cloud_lies_within_1_8_mm(mean_error_mm, seed):
+    # Calibration alone is 1 mm; the rest is mostly breathing, of which a small chest meets few breaths. Over 24 seeds
+    # the mean is 1.2 mm and the largest 1.7.
     error = mean_error_mm(SweepErrors(), seed)
-    assert 0.3 < error < 1.5
+    assert 0.3 < error < 1.8
 
 
 def test_uncorrected_latency_shifts_by_speed_times_lag(record):
@@ -108,19 +112,40 @@ def test_dropped_frames_and_missed_strips(chest, record, seen):
     assert 0.01 < len(missed) / len(fixture) < 0.15
 
 
-def test_breathing_moves_the_chest_by_its_amplitude():
+def swept_plate(errors, **options):
     near = box((120, 4, 100))
     plate = Mesh(near.vertices, near.faces, np.zeros(len(near.vertices)))
-    clean, breath = (
-        simulate_sweep(plate, FRONT, errors, np.random.default_rng(0))
-        for errors in (SweepErrors.none(), SweepErrors.only("breathing"))
-    )
+    return simulate_sweep(plate, FRONT, errors, np.random.default_rng(0), **options)
+
+
+@pytest.mark.parametrize("speed_mm_s", [20.0, 600.0])  # many breaths; less than one
+def test_breathing_moves_the_chest_by_what_it_says(speed_mm_s):
+    fast = Probe(speed_mm_s=speed_mm_s, frames_per_s=min(1.5 * speed_mm_s, 120.0))
+    clean, breath = (swept_plate(errors, probe=fast) for errors in (SweepErrors.none(), SweepErrors.only("breathing")))
+    taken_s = breath.frame_times_s - LATENCY_S
+    assert (np.ptp(taken_s) < 2) == (speed_mm_s > 100)
+    displacement = quiet_breathing(taken_s, SweepErrors().breathing_mm, np.random.default_rng(0).spawn(8)[3])
     difference = depths_mm(breath) - depths_mm(clean)
-    shown = np.nanmedian(difference[np.isfinite(difference).any(axis=1)], axis=1)
-    # 4 mm peak to peak, half-way between head and front; the edges of the plate and pixels of 0.2 mm blur it.
-    ventral_mm = SweepErrors().breathing_mm / np.sqrt(2)
-    assert np.percentile(shown, 97) - np.percentile(shown, 3) == pytest.approx(ventral_mm, abs=0.3)
-    assert abs(shown.mean()) < 0.2  # about the mean position: breathing shifts nothing in the long run
+    seen = np.isfinite(difference).sum(axis=1) > 100  # not at the plate's ends
+    assert seen.sum() > 40
+    # Half-way between head and front; pixels of 0.2 mm and beams that are not quite upright blur it.
+    shown = np.nanmedian(difference[seen], axis=1)
+    np.testing.assert_allclose(shown, -displacement[seen] / np.sqrt(2), atol=0.35)
+    assert np.ptp(shown) > 0.5
+
+
+def test_without_breathing_nobody_breathes_and_nothing_else_changes(monkeypatch):
+    still = dataclasses.replace(SweepErrors(), breathing_mm=0.0)
+    off, on = swept_plate(still), swept_plate(SweepErrors())
+    monkeypatch.setattr(virtual_sweep, "quiet_breathing", lambda times, size, rng: np.zeros(len(times)))
+    without = swept_plate(SweepErrors())
+    np.testing.assert_array_equal(off.masks, without.masks)
+    assert (on.masks != off.masks).any()
+    for other in (off, on):
+        np.testing.assert_array_equal(other.frame_times_s, without.frame_times_s)
+        np.testing.assert_array_equal(other.poses, without.poses)
+        np.testing.assert_array_equal(other.T_probe_image.matrix, without.T_probe_image.matrix)
+        assert other.latency_s == without.latency_s
 
 
 @pytest.mark.parametrize("source", ERROR_SOURCES)

@@ -142,7 +142,7 @@ class DisturbedPair:
 
     Attributes:
         ct: CT cloud, its true parts known.
-        us: US cloud, its parts those of the nearest point of the undisturbed one.
+        us: US cloud, its parts those of the nearest point of the undisturbed one; with times where it was swept.
         waypoints: (k, 3) mm, of the CT.
         goal: (k, 3) mm, where they truly belong in the US.
     """
@@ -164,16 +164,21 @@ def disturbed_pair(disturbance: Disturbance, seed: int) -> DisturbedPair:
     if d.deformation != 1:
         patient = between(person, patient, d.deformation)
     clean = phantom.anterior_cloud(patient, d.us_points, 0.0, 0, named_rng(seed, "robustness/us"))
-    us = clean.points if d.calibration_mm is None else _swept(patient, d.calibration_mm, seed)
+    seen = clean if d.calibration_mm is None else _swept(patient, d.calibration_mm, seed)
+    us, times = seen.points, seen.times
     _, index = nearest(us, clean.points)
     kept = ~_missing(d, us, _true_parts(clean)[index], seed)
     us = us[kept] + d.noise_mm * named_rng(seed, "robustness/noise").normal(size=us.shape)[kept]
-    us = _with_outliers(us, d.outlier_share, named_rng(seed, "robustness/outliers"))
+    n_seen, outliers = len(us), named_rng(seed, "robustness/outliers")
+    us = _with_outliers(us, d.outlier_share, outliers)
+    if times is not None:  # an outlier is seen at any time
+        n_outliers = len(us) - n_seen
+        times = np.concatenate([times[kept], outliers.uniform(times.min(), times.max(), n_outliers)])
     _, index = nearest(us, clean.points)
     path = phantom.waypoints(person).points
     return DisturbedPair(
         _ct_cloud(person, d, seed),
-        PointCloud(us, f"us:{seed}", _true_parts(clean)[index], FRONT),
+        PointCloud(us, f"us:{seed}", _true_parts(clean)[index], FRONT, times),
         path,
         phantom.truth_map(person, patient, path),
     )
@@ -198,8 +203,8 @@ def _ct_cloud(person: phantom.SyntheticSubject, d: Disturbance, seed: int) -> Po
     return sample_cloud(surface(mask), d.ct_points, named_rng(seed, "robustness/ct"))
 
 
-def _swept(patient: phantom.SyntheticSubject, calibration_mm: float, seed: int) -> Floats:
-    """Points (n, 3) mm, RAS+, of a virtual sweep over a patient with that calibration error and all others."""
+def _swept(patient: phantom.SyntheticSubject, calibration_mm: float, seed: int) -> PointCloud:
+    """The cloud, RAS+ and with times, of a virtual sweep over a patient with that calibration error and all others."""
     surface_ = canonical_surface()
     used, faces = np.unique(surface_.faces, return_inverse=True)
     parts = np.full(len(surface_.vertices), int(Part.STERNUM))
@@ -207,7 +212,7 @@ def _swept(patient: phantom.SyntheticSubject, calibration_mm: float, seed: int) 
     mesh = Mesh(patient.phi.apply(surface_.vertices[used]), faces.reshape(-1, 3), parts[used], f"phantom:{seed}")
     errors = replace(SweepErrors(), calibration_mm=calibration_mm, calibration_deg=DEG_PER_MM * calibration_mm)
     sweep = simulate_sweep(mesh, FRONT, errors, named_rng(seed, "robustness/sweep"))
-    return sweep_cloud(sweep, spacing_mm=SWEEP_SPACING_MM).cloud.points
+    return sweep_cloud(sweep, spacing_mm=SWEEP_SPACING_MM).cloud
 
 
 def _missing(d: Disturbance, us: Floats, parts: Ints, seed: int) -> Bools:

@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from study.files.clouds import read_ply, read_waypoints, write_ply, write_registration
+    from study.files.clouds import read_ply, read_timed_ply, read_waypoints, write_ply, write_registration
     from study.files.landmarks import read_landmarks
     from study.files.plus import read_plus
     from study.files.plus_write import write_plus
@@ -18,6 +18,7 @@ __all__ = [
     "read_masks",
     "read_plus",
     "read_ply",
+    "read_timed_ply",
     "read_volume",
     "read_waypoints",
     "write_folder",
@@ -34,6 +35,7 @@ _HOMES = {
     "read_masks": "volumes",
     "read_plus": "plus",
     "read_ply": "clouds",
+    "read_timed_ply": "clouds",
     "read_volume": "volumes",
     "read_waypoints": "clouds",
     "write_folder": "sweep_folder",

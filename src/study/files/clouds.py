@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,9 +16,11 @@ import trimesh
 from study.errors import StudyError
 from study.files.atomic import write_bytes, write_text
 from study.registration import Registration
-from study.types import Floats, PointCloud, Waypoints, as_points
+from study.types import Floats, PointCloud, Waypoints, as_points, as_times
 
 NOT_CARRIED = "waypoint not carried"
+TIME = "time"  # the property of a PLY file's vertices that says when each was seen, s
+MAX_STEP_S = 0.05  # between two times that a file can tell apart: a frame or two
 
 
 def read_ply(path: str | os.PathLike[str]) -> Floats:
@@ -25,6 +29,33 @@ def read_ply(path: str | os.PathLike[str]) -> Floats:
     Raises:
         StudyError: no such file, or not a PLY file with points.
     """
+    return _read_vertices(path)[0]
+
+
+def read_timed_ply(path: str | os.PathLike[str]) -> tuple[Floats, Floats | None]:
+    """Points (n, 3) of a PLY file, and times (n,) s where its vertices have a property ``time``, else None.
+
+    Raises:
+        StudyError: as `read_ply`; times that are not finite, or that single precision has rounded to nothing.
+    """
+    points, columns = _read_vertices(path)
+    if TIME not in columns:
+        return points, None
+    name, column = Path(path).name, np.asarray(columns[TIME]).reshape(-1)
+    times = as_times(column, len(points), name)
+    if column.dtype == np.float32 and np.spacing(np.abs(column).max()) > MAX_STEP_S:
+        raise StudyError(
+            f"{name}: expected times to {MAX_STEP_S:g} s or finer, got single precision at {times.max():.0f} s, which "
+            "is coarser; write them as double, or count from the start of the sweep"
+        )
+    raw = np.column_stack([np.asarray(columns[axis]).reshape(-1) for axis in "xyz"])
+    if not np.array_equal(raw, points):  # a textured mesh is cut up along its seams
+        raise StudyError(f"{name}: expected times for the points of a cloud, got a mesh; export its vertices alone")
+    return points, times
+
+
+def _read_vertices(path: str | os.PathLike[str]) -> tuple[Floats, Mapping[str, Any]]:
+    """Points (n, 3) of a PLY file, and its vertices' x, y, z and, where there is one, time, as the file has them."""
     path = Path(path)
     if not path.is_file():
         raise StudyError(f"expected a PLY file at {path}, got no such file; check the path")
@@ -35,7 +66,9 @@ def read_ply(path: str | os.PathLike[str]) -> Floats:
         raise StudyError(
             f"{path.name}: expected a PLY file with points, got unreadable bytes: {reason}; export it again"
         ) from error
-    return as_points(getattr(loaded, "vertices", np.empty((0, 3))), path.name)
+    points = as_points(getattr(loaded, "vertices", np.empty((0, 3))), path.name)
+    vertex = loaded.metadata["_ply_raw"]["vertex"]
+    return points, {name: vertex["data"][name] for name in (*"xyz", TIME) if name in vertex["properties"]}
 
 
 def read_waypoints(path: str | os.PathLike[str]) -> Waypoints:
@@ -82,16 +115,18 @@ def as_ply_path(path: str | os.PathLike[str]) -> Path:
 
 
 def write_ply(cloud: PointCloud, path: str | os.PathLike[str]) -> Path:
-    """Write a cloud's points as binary PLY, mm, in double precision and in their order.
+    """Write a cloud's points as binary PLY, mm, and its times, s, in double precision and in their order.
 
     Raises:
         StudyError: another suffix.
     """
     path = as_ply_path(path)
     # By hand, since trimesh rounds to single precision: half a micrometre a metre away from the origin.
-    properties = "".join(f"property double {axis}\n" for axis in "xyz")
+    names = "xyz" if cloud.times is None else [*"xyz", TIME]
+    rows = cloud.points if cloud.times is None else np.column_stack([cloud.points, cloud.times])
+    properties = "".join(f"property double {name}\n" for name in names)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n{properties}end_header\n"
-    content = header.encode("ascii") + cloud.points.astype("<f8").tobytes()
+    content = header.encode("ascii") + rows.astype("<f8").tobytes()
     write_bytes(path, content)
     return path
 

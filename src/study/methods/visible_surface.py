@@ -69,8 +69,7 @@ class VisibleSurface:
                 f"{source.name}: expected {self.neighbours} visible points or more, got {seen.sum()}; "
                 "pass a denser cloud or fewer neighbours"
             )
-        parts = None if source.parts is None else source.parts[seen]
-        result = self.method.register(replace(source, points=source.points[seen], parts=parts), target, rng)
+        result = self.method.register(source.subset(seen), target, rng)
         warped = np.empty_like(source.points)
         warped[seen] = result.warped
         warped[~seen] = result.carry(source.points[~seen], self.neighbours)

@@ -43,7 +43,8 @@ class SweepCloud:
     """The cloud of a sweep, and what the sweep knows beyond its points.
 
     Attributes:
-        cloud: points (n, 3) mm in the base frame, no parts.
+        cloud: points (n, 3) mm in the base frame, and when each was seen, (n,) s on the poses' clock; no parts. A point
+            where two lines overlap is the mean of both, and so is its time.
         beam: (3,) unit vector, the mean direction in which the beams looked, base frame.
         report: frames used and dropped.
     """
@@ -156,11 +157,11 @@ def thin_evenly(points: Floats, spacing_mm: float) -> Floats:
     kept greedily (Poisson-disc thinning).
 
     Args:
-        points: (n, 3) mm.
+        points: (n, 3 + c): mm, and columns that follow their points, such as times.
         spacing_mm: least distance between two points kept.
 
     Returns:
-        (k, 3) mm: averages, not members of ``points``.
+        (k, 3 + c): averages, not members of ``points``.
 
     Raises:
         StudyError: a spacing of 0 or less.
@@ -170,12 +171,13 @@ def thin_evenly(points: Floats, spacing_mm: float) -> Floats:
     # Columns of one frame are an exact fraction of a millimetre apart, so many points would lie on the side of a cube,
     # and many distances be the spacing, to the last bit, which differs between machines. A third of a cube and 1 nm
     # put each of them clearly on one side.
-    cells = np.floor((points - points.min(axis=0)) / (spacing_mm / 2) + 1 / 3).astype(np.int64)
+    places = points[:, :3]
+    cells = np.floor((places - places.min(axis=0)) / (spacing_mm / 2) + 1 / 3).astype(np.int64)
     _, member, count = np.unique(
         np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True, return_counts=True
     )
-    means = np.column_stack([np.bincount(member, points[:, axis]) for axis in range(3)]) / count[:, None]
-    pairs = KDTree(means).query_pairs(spacing_mm + 1e-6, output_type="ndarray")
+    means = np.column_stack([np.bincount(member, column) for column in points.T]) / count[:, None]
+    pairs = KDTree(means[:, :3]).query_pairs(spacing_mm + 1e-6, output_type="ndarray")
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
     ends = np.searchsorted(pairs[:, 0], np.arange(len(means) + 1))
     kept = np.ones(len(means), dtype=bool)
@@ -213,7 +215,8 @@ def sweep_cloud(sweep: TrackedSweep, *, spacing_mm: float = 1.5, max_gap_s: floa
     >>> made.report.n_contour, float(made.cloud.points[:, 2].mean().round(2)), made.beam.round(2).tolist()
     (4000, 19.75, [0.0, 0.0, 1.0])
     """
-    points, _, beam, report = contour_points(sweep, max_gap_s=max_gap_s)
-    thinned = thin_evenly(points, spacing_mm)
+    points, frames, beam, report = contour_points(sweep, max_gap_s=max_gap_s)
+    taken_s = sweep.frame_times_s - sweep.latency_s
+    thinned = thin_evenly(np.column_stack([points, taken_s[frames]]), spacing_mm)
     counted = replace(report, n_points=len(thinned))
-    return SweepCloud(PointCloud(thinned, sweep.name), beam, counted)
+    return SweepCloud(PointCloud(thinned[:, :3], sweep.name, times=thinned[:, 3]), beam, counted)

@@ -21,8 +21,8 @@ def constant_shift_mm(sweep: TrackedSweep, errors: SweepErrors, probe: Probe | N
     Each contour pixel is placed twice: by the calibration that the experimenter believes in, at the depth that the
     image shows; and by the true calibration, at the true depth. The mean of the differences over all contour points
     is the shift. It is exact for the same pixels and poses; what varies about it with the probe's turns is not in it,
-    nor are errors without a mean of their own (latency, which changes sign with the direction of a line, breathing,
-    tracking, contour).
+    nor are errors without a mean of their own (latency, which changes sign with the direction of a line, tracking,
+    contour; breathing, whose mean is 0 over many breaths though not over the few of one sweep).
 
     Truth for judging by, never for making a cloud.
 

@@ -55,7 +55,11 @@ class SweepErrors:
         4.0, "mm", "missed strips", "mean gap a hand leaves between lines without seeing it (assumed)"
     )
     breathing_mm: float = _size(
-        4.0, "mm", "breathing", "3-5 mm cranially and ventrally, 1-2 mm laterally in quiet breathing; peak to peak"
+        4.0,
+        "mm",
+        "breathing",
+        "3-5 mm cranially and ventrally, 1-2 mm laterally in quiet breathing; peak to peak of a mean breath, which"
+        " others differ from as `study.ultrasound.breathing` says",
     )
 
     def __post_init__(self) -> None:

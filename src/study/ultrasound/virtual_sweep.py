@@ -11,6 +11,7 @@ from study.errors import StudyError
 from study.geometry.points import unit
 from study.geometry.rays import first_hits
 from study.types import Bools, Floats, Mesh, RigidTransform
+from study.ultrasound.breathing import quiet_breathing
 from study.ultrasound.hand import Hand
 from study.ultrasound.probe import Probe
 from study.ultrasound.skin import Skin
@@ -19,7 +20,6 @@ from study.ultrasound.tracked import TrackedSweep
 
 SPEED_ASSUMED_M_S = 1540.0
 SPEED_FAT_M_S = 1440.0
-BREATH_S = 4.0  # 15 breaths a minute at rest
 JITTER_LENGTH_MM = 2.0  # a hand-drawn contour strays smoothly, not pixel by pixel
 
 
@@ -38,7 +38,8 @@ def simulate_sweep(
 
     Lines run head to foot and back, side by side, over a smooth skin; the probe follows its normal. Every beam
     stops at what it meets first. Switching one error does not change the random draws of another, so two sweeps
-    of one seed differ by that error only.
+    of one seed differ by that error only. Breathing moves the anatomy about where it is given, its mean position over
+    many breaths: there the truth of a patient lies, whatever part of them a sweep meets.
 
     Args:
         mesh: sternum and cartilages, mm; its parts are not used.
@@ -62,7 +63,7 @@ def simulate_sweep(
     hand = Hand.over(skin, probe, _strips(errors, strips, probe), steady)
 
     frame_times = _frame_times(errors, steady, drops, hand)
-    depth = _cast_frames(mesh, hand, frame_times, _breathing(errors, breath, frame_times))
+    depth = _cast_frames(mesh, hand, frame_times, quiet_breathing(frame_times, errors.breathing_mm, breath))
     depth += _delay_in_fat(errors, depth)
     depth += _contour_jitter(errors, contour, depth.shape, probe.pixel_mm)
     masks = _render(depth, probe)
@@ -97,14 +98,11 @@ def _frame_times(errors: SweepErrors, steady: np.random.Generator, drops: np.ran
     return times[drops.random(len(times)) >= errors.dropped]
 
 
-def _breathing(errors: SweepErrors, rng: np.random.Generator, times: Floats) -> Floats:
-    """Displacement (n,) mm of the chest along cranio-ventral, about its mean position."""
-    phase = rng.uniform(0, 2 * np.pi)
-    return errors.breathing_mm / 2 * np.sin(2 * np.pi * times / BREATH_S + phase)
-
-
 def _cast_frames(mesh: Mesh, hand: Hand, times: Floats, breath_mm: Floats) -> Floats:
-    """Depth (f, w) mm of the first surface under each column, infinite where there is none."""
+    """Depth (f, w) mm of the first surface under each column, infinite where there is none.
+
+    ``breath_mm`` (f,) is the chest's displacement along cranio-ventral from its mean position.
+    """
     rotation, position = hand.poses_at(times)
     probe, skin = hand.probe, hand.skin
     lateral = (np.arange(probe.shape[1]) - (probe.shape[1] - 1) / 2) * probe.pixel_mm
