@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from study.errors import StudyError
-from study.registration import Registration, transfer
+from study.registration import FieldRegistration, Registration, transfer
 from study.types import RigidTransform
 
 WALL = np.random.default_rng(0).uniform([-60, -5, -60], [60, 5, 60], (2000, 3))
@@ -80,6 +80,47 @@ def test_a_registration_offers_the_verb():
     assert result.transfer(WAYPOINTS, radius_mm=30) == pytest.approx(motion.apply(WAYPOINTS), abs=1e-9)
     with pytest.raises(StudyError, match=r"within 0\.1 mm"):
         result.transfer(WAYPOINTS, radius_mm=0.1)
+
+
+class Bend:
+    """A field that no rigid fit follows."""
+
+    def apply(self, points):
+        return points + np.column_stack([0 * points[:, 0], 9 * np.sin(points[:, 0] / 9), 0 * points[:, 0]])
+
+
+def bent_wall(motion):
+    warped = Bend().apply(motion.apply(WALL))
+    return FieldRegistration(WALL, warped, motion, True, 1, "planted", field=Bend())
+
+
+def test_a_field_carries_waypoints_itself_wherever_the_ct_lies():
+    motion = RigidTransform.random(np.random.default_rng(4), shift_mm=20.0)
+    result = bent_wall(motion)
+    truth = Bend().apply(motion.apply(WAYPOINTS))
+    assert result.transfer(WAYPOINTS.tolist()) == pytest.approx(truth, abs=1e-9)
+    assert np.linalg.norm(transfer(WALL, result.warped, WAYPOINTS) - truth, axis=1).max() > 1.0  # the sphere cannot
+    assert result.carry(WALL) == pytest.approx(result.warped, abs=1e-9)
+
+
+def test_a_field_says_nothing_far_from_the_cloud():
+    waypoints = np.vstack([WAYPOINTS[:2], [0, 200.0, 0]])
+    result = bent_wall(RigidTransform())
+    path = result.carry_path(waypoints)
+    assert path.reasons[:2] == ("", "")
+    assert "expected CT points within 50 mm, got none within 195" in path.reasons[2]
+    assert np.isnan(path.points[2]).all()
+    assert np.isfinite(path.points[:2]).all()
+    with pytest.raises(StudyError, match="waypoint 2: expected CT points within 50 mm"):
+        result.transfer(waypoints, radius_mm=300.0)
+
+
+def test_waypoints_for_a_field_are_checked_like_those_for_a_sphere():
+    result = bent_wall(RigidTransform())
+    with pytest.raises(StudyError, match="expected a path in millimetres"):
+        result.transfer(WAYPOINTS / 1000)
+    with pytest.raises(StudyError, match="expected finite"):
+        result.transfer([[0, 0, np.nan]])
 
 
 def test_a_registration_shows_itself_in_a_notebook():

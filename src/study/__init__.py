@@ -7,6 +7,7 @@ __version__ = "0.3.0"
 
 # Found on first use: importing the methods costs seconds, which `study data list` need not pay.
 _HOMES = {
+    "BEST_METHOD": "study.methods",
     "METHODS": "study.methods",
     "PointCloud": "study.types",
     "Registration": "study.registration",
@@ -18,6 +19,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "BEST_METHOD",
     "METHODS",
     "PointCloud",
     "Registration",

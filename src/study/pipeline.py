@@ -19,7 +19,6 @@ from study.geometry.points import nearest, principal_axes, unit
 # batch, loads them before: a limit of threads holds only for the pools that are there when it is set, and Open3D brings
 # one; nor does the clock measure an import.
 from study.methods import METHODS, drift, mesh  # noqa: F401
-from study.methods.visible_surface import carry
 from study.quality import QUALITY_LIMITS, SWAPPED, measure_quality, quality_warnings
 from study.registration import Method, Registration
 from study.seeds import named_rng
@@ -58,7 +57,7 @@ def register_pair(
     Args:
         ct: (n, 3) mm, sternum and cartilages 2-5 of both sides, any rigid pose.
         us: (m, 3) mm, the same anatomy as ultrasound sees it, any rigid pose.
-        method: a name in ``METHODS``.
+        method: a name in ``METHODS``; the default is the paper's, `study.BEST_METHOD` has the smallest true error.
         seed: draws of the method.
         front: (3,) direction from the chest to the probe in the US frame, where it is known; a swept cloud's own when
             None. Branches that arch the other way are refused.
@@ -93,7 +92,7 @@ def register_pair(
     result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
     if len(alignment.source.cloud) == len(given):
         return result
-    return replace(result, source=given.points, warped=carry(given.points, result.source, result.warped, CARRIERS))
+    return replace(result, source=given.points, warped=result.carry(given.points, CARRIERS))
 
 
 def _as_cloud(

@@ -11,12 +11,13 @@ from scipy.spatial import KDTree
 
 from study import preview
 from study.errors import StudyError
-from study.geometry.points import fit_rigid
+from study.geometry.points import fit_rigid, fit_rigid_batch, nearest
 from study.quality import Quality
 from study.types import Floats, PointCloud, RigidTransform, as_points
 
 MIN_SUPPORT = 3  # points that hold a rigid motion
 MIN_WIDTH_MM = 1e-6  # second singular value of points that lie on a line but for rounding
+REACH_MM = 50.0  # from the CT points, beyond which a field is a guess
 MIN_PATH_MM = 1.0  # extent of a path; one in metres is a fraction of a millimetre across
 
 
@@ -32,6 +33,33 @@ class CarriedPath:
     points: Floats
     reasons: tuple[str, ...]
 
+    def complete(self) -> Floats:
+        """The points (k, 3) mm, all of them good.
+
+        Raises:
+            StudyError: a waypoint that could not be carried.
+        """
+        for number, reason in enumerate(self.reasons):
+            if reason:
+                raise StudyError(f"expected waypoints that can all be carried, got waypoint {number}: {reason}")
+        return self.points
+
+
+def as_waypoints(waypoints: ArrayLike) -> Floats:
+    """Check and copy waypoints as a read-only (k, 3) float64 array, mm.
+
+    Raises:
+        StudyError: what `study.types.as_points` refuses, or waypoints in metres.
+    """
+    path = as_points(waypoints, "waypoints")
+    extent = float(np.linalg.norm(np.ptp(path, axis=0)))
+    if 0 < extent < MIN_PATH_MM:
+        raise StudyError(
+            f"waypoints: expected a path in millimetres, got {len(path)} points {extent:.2g} mm across; metres? "
+            "multiply by 1000"
+        )
+    return path
+
 
 def carry_path(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radius_mm: float = 20.0) -> CarriedPath:
     """Move each waypoint by the rigid fit of the cloud points around it (sec. III-D), a bad one for itself.
@@ -45,7 +73,7 @@ def carry_path(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, ra
     Raises:
         StudyError: clouds that do not pair, a radius that is none, or waypoints in metres.
     """
-    waypoints = as_points(waypoints, "waypoints")
+    waypoints = as_waypoints(waypoints)
     source, warped = as_points(source, "source"), as_points(warped, "warped")
     if source.shape != warped.shape:
         raise StudyError(
@@ -54,12 +82,6 @@ def carry_path(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, ra
         )
     if not 0 < radius_mm < np.inf:
         raise StudyError(f"expected radius_mm > 0, got {radius_mm}; the paper's is 20")
-    extent = float(np.linalg.norm(np.ptp(waypoints, axis=0)))
-    if 0 < extent < MIN_PATH_MM:
-        raise StudyError(
-            f"waypoints: expected a path in millimetres, got {len(waypoints)} points {extent:.2g} mm across; metres? "
-            "multiply by 1000"
-        )
     moved, reasons = np.full_like(waypoints, np.nan), []
     for k, members in enumerate(KDTree(source).query_ball_point(waypoints, radius_mm)):
         local = source[members]
@@ -90,11 +112,16 @@ def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radi
         >>> transfer(wall, wall * [1.02, 1, 1] + [0, 5, 0], [[50, -10, 20]]).round(1)
         array([[51., -5., 20.]])
     """
-    path = carry_path(source, warped, waypoints, radius_mm=radius_mm)
-    for number, reason in enumerate(path.reasons):
-        if reason:
-            raise StudyError(f"expected waypoints that can all be carried, got waypoint {number}: {reason}")
-    return path.points
+    return carry_path(source, warped, waypoints, radius_mm=radius_mm).complete()
+
+
+def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Floats:
+    """Move each of ``points`` (k, 3) by the rigid motion of its nearest ``source`` (n, 3) to ``warped`` (n, 3)."""
+    _, index = KDTree(source).query(points, k=neighbours)
+    weights = np.full(index.shape, 1 / neighbours)
+    rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
+    carried: Floats = np.einsum("nij,nj->ni", rotations, points) + translations
+    return carried
 
 
 def _on_a_line(points: Floats) -> bool:
@@ -144,12 +171,35 @@ class Registration:
     quality: Quality | None = None
 
     def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
-        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits (sec. III-D).
+        """`carry_path` of waypoints that must all be good: (k, 3) mm in the US frame.
 
         Raises:
             StudyError: fewer than 3 cloud points within ``radius_mm`` of a waypoint.
         """
-        return transfer(self.source, self.warped, waypoints, radius_mm=radius_mm)
+        return self.carry_path(waypoints, radius_mm).complete()
+
+    def carry_path(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> CarriedPath:
+        """Waypoints (k, 3) mm from the CT frame into the US frame by local rigid fits (sec. III-D).
+
+        Raises:
+            StudyError: as the function `carry_path`.
+        """
+        return carry_path(self.source, self.warped, waypoints, radius_mm=radius_mm)
+
+    def bounds(self, waypoints: ArrayLike) -> Floats:
+        """How far (k,) mm at most each transferred waypoint lies from its true place, 19 times in 20.
+
+        Raises:
+            StudyError: a method that says nothing of its error, as most do.
+        """
+        raise StudyError(
+            f"{self.method or 'this registration'}: expected a method with bounds, got one without; study.BEST_METHOD "
+            "has them"
+        )
+
+    def carry(self, points: Floats, neighbours: int) -> Floats:
+        """Where other places (k, 3) mm of the CT lie in the US frame: each goes along with its nearest CT points."""
+        return carry(points, self.source, self.warped, neighbours)
 
     def _repr_html_(self) -> str:
         """A few lines, and the warped cloud coloured by how far each point left the rigid part."""
@@ -164,6 +214,45 @@ class Registration:
             "colour": f"distance from the rigid part, 0 to {bent_mm.max():.1f} mm",
         }
         return preview.card(f"Registration: {self.method or 'unnamed'}", lines, preview.by_size(self.warped, bent_mm))
+
+
+class Field(Protocol):
+    """A map of space, known anywhere."""
+
+    def apply(self, points: Floats) -> Floats:
+        """Where points (k, 3) mm of the US frame come to lie in it."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldRegistration(Registration):
+    """A registration that knows where any place goes, not its points only; its waypoints need no local fits.
+
+    Attributes:
+        field: takes the CT after ``T_us_ct`` to its places in the US frame; ``warped`` is what it makes of ``source``.
+    """
+
+    field: Field
+
+    def carry_path(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> CarriedPath:
+        """Waypoints (k, 3) mm from the CT frame into the US frame by the field itself; ``radius_mm`` plays no part.
+
+        Raises:
+            StudyError: waypoints that are none. One far from the CT points, where nothing holds the field, has a
+                reason instead.
+        """
+        path = as_waypoints(waypoints)
+        away, _ = nearest(path, self.source)
+        far = away > REACH_MM
+        reasons = tuple(
+            f"expected CT points within {REACH_MM:g} mm, got none within {mm:.0f}; check its frame" if bad else ""
+            for mm, bad in zip(away, far, strict=True)
+        )
+        return CarriedPath(np.where(far[:, None], np.nan, self.carry(path)), reasons)
+
+    def carry(self, points: Floats, neighbours: int = 0) -> Floats:
+        """Where other places (k, 3) mm of the CT lie in the US frame, by the field."""
+        return self.field.apply(self.T_us_ct.apply(points))
 
 
 @runtime_checkable

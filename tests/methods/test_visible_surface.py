@@ -7,7 +7,8 @@ from study.alignment.chest import align
 from study.alignment.frame import chest_frame
 from study.errors import StudyError
 from study.methods.icp import Icp
-from study.methods.visible_surface import VisibleSurface, carry, faces_front
+from study.methods.visible_surface import VisibleSurface, faces_front
+from study.registration import carry
 from study.types import PointCloud, RigidTransform
 
 

@@ -108,6 +108,8 @@ METHOD_STYLE: Mapping[str, MethodStyle] = {
     **_styles("cpd", "CPD", "#009988", "^"),
     **_styles("skeleton_graph", "Skeleton graph", "#CC3311", "D"),
     "skeleton_graph_authors": MethodStyle("Skeleton graph, authors' code", "#882255", "d", tuned=False),
+    "skeleton_graph_repaired": MethodStyle("Skeleton graph, repaired", "#CC3311", "H", tuned=True, visible=True),
+    "gaussian_process": MethodStyle("Gaussian process", "#009900", "h", tuned=True, visible=True),
     # No method: the known deformation, judged like one.
     TRUTH: MethodStyle("Perfect (truth)", "#222222", "*", tuned=True),
 }

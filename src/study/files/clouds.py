@@ -15,7 +15,7 @@ import trimesh
 
 from study.errors import StudyError
 from study.files.atomic import write_bytes, write_text
-from study.registration import Registration, carry_path
+from study.registration import Registration
 from study.types import Floats, PointCloud, Waypoints, as_points, as_times
 
 NOT_CARRIED = "waypoint not carried"
@@ -152,7 +152,7 @@ def write_registration(
     """
     table, told = None, []
     if waypoints is not None:
-        path = carry_path(result.source, result.warped, waypoints.points, radius_mm=radius_mm)
+        path = result.carry_path(waypoints.points, radius_mm)
         told = [f"{label}: {reason}" for label, reason in zip(waypoints.labels, path.reasons, strict=True) if reason]
         if len(told) == len(waypoints):
             raise StudyError(f"waypoints: expected one or more that can be carried, got none: {told[0]}")

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from study.alignment.frame import ChestFrame, chest_frame
 from study.errors import StudyError
-from study.geometry.points import fit_rigid_batch, foremost_in_cells, sample_spacing_mm
+from study.geometry.points import foremost_in_cells, sample_spacing_mm
 from study.registration import Method, Registration
 from study.types import Bools, Floats, PointCloud
 
@@ -40,7 +39,7 @@ class VisibleSurface:
 
     Attributes:
         method: what registers the visible points.
-        neighbours: visible points whose rigid motion carries a hidden point.
+        neighbours: visible points whose rigid motion carries a hidden point; a method with a field needs none.
     """
 
     name: ClassVar[str] = "visible_surface"
@@ -73,14 +72,5 @@ class VisibleSurface:
         result = self.method.register(source.subset(seen), target, rng)
         warped = np.empty_like(source.points)
         warped[seen] = result.warped
-        warped[~seen] = carry(source.points[~seen], result.source, result.warped, self.neighbours)
+        warped[~seen] = result.carry(source.points[~seen], self.neighbours)
         return replace(result, source=source.points, warped=warped)
-
-
-def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Floats:
-    """Move each of ``points`` (k, 3) by the rigid motion of its nearest ``source`` (n, 3) to ``warped`` (n, 3)."""
-    _, index = KDTree(source).query(points, k=neighbours)
-    weights = np.full(index.shape, 1 / neighbours)
-    rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
-    carried: Floats = np.einsum("nij,nj->ni", rotations, points) + translations
-    return carried

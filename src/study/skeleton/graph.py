@@ -44,3 +44,15 @@ class SkeletonGraph:
         weights = csr_array((np.ones(len(self.edges)), (self.edges[:, 0], self.edges[:, 1])), shape=(m, m))
         lengths = shortest_path(weights, directed=directed, unweighted=True)
         return np.where(np.isinf(lengths), m, lengths).astype(np.int64)
+
+    def edge_lengths_mm(self) -> Floats:
+        """(e,) mm from end to end of each edge."""
+        ends = self.nodes[self.edges]
+        lengths: Floats = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        return lengths
+
+    def geodesics_mm(self) -> Floats:
+        """(m, m) mm from node to node along the links, either way; infinity without a path."""
+        links = csr_array((self.edge_lengths_mm(), (self.edges[:, 0], self.edges[:, 1])), shape=(len(self), len(self)))
+        lengths: Floats = shortest_path(links, directed=False)
+        return lengths
