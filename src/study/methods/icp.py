@@ -49,12 +49,12 @@ class Icp:
     @classmethod
     def tuned(cls) -> Icp:
         """The best row of ``results/tuning/icp.csv``: the visible surface of development subjects, by tools/tune.py."""
-        return cls(max_distance_mm=2.0, max_iterations=200)
+        return cls(max_distance_mm=7.0, max_iterations=200)
 
     @classmethod
     def tuned_whole(cls) -> Icp:
         """The best row of ``results/tuning/icp_whole.csv``: the whole tube of the same subjects."""
-        return cls(max_distance_mm=5.0, max_iterations=200)
+        return cls(max_distance_mm=5.0, point_to_plane=True, max_iterations=200)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Fit ``source`` to ``target`` rigidly; nothing is drawn from ``rng``.

@@ -85,7 +85,7 @@ class NonrigidIcp:
     @classmethod
     def tuned_whole(cls) -> NonrigidIcp:
         """The best row of ``results/tuning/nonrigid_icp_whole.csv``: the whole tube of the same subjects."""
-        return replace(cls.tuned(), distance_threshold=0.05)
+        return replace(cls.tuned(), gamma=10.0, distance_threshold=0.05)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Bend ``source`` onto ``target``; nothing is drawn from ``rng``.
