@@ -206,6 +206,12 @@ def test_both_surfaces_are_tuned_on_one_grid_and_every_row_is_recorded(tune: Mod
         assert sorted(recorded["setting"]) == list(range(len(rows)))
 
 
+def test_the_field_method_is_tuned_on_people_of_three_kinds_and_every_row_is_recorded(tune: ModuleType) -> None:
+    recorded = pd.read_csv(ROOT / "results" / "tuning" / "gaussian_process.csv")
+    assert sorted(recorded["setting"]) == list(range(len(list(tune.grid("gaussian_process")))))
+    assert min(len(tune.PAIRS), len(tune.FULL_SPREAD), len(tune.PLANTED)) >= 4
+
+
 def test_a_grid_runs_on_the_surface_that_its_table_is_named_after(
     tune: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -6,7 +6,9 @@ The development subjects are phantoms of cohort seeds that the study does not re
 CT volume, labels, surface and cloud of the atlas; a virtual sweep with all errors on of the patient; coarse alignment.
 Each row is run on the surface that ultrasound can see (``icp.csv``) and on the whole tube (``icp_whole.csv``). The best
 row of a table has the smallest mean true waypoint error. `Icp.tuned()`, `Icp.tuned_whole()` and their like hold that
-row, and a test holds them to the table. The last grid runs each winner of the visible surface on the whole tube, too.
+row, and a test holds them to the table. The grid ``visible_surface`` runs each winner of the visible surface on the
+whole tube, too. ``gaussian_process``, whose prior says how people differ, is tuned on people of three kinds: those
+phantoms, phantoms over the whole published spread, and deformations planted into every real CT by a seed of its own.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -21,18 +24,24 @@ from typing import Any
 import pandas as pd
 
 from study.data.manifest import load_manifest
-from study.datasets.people import make_patient
+from study.datasets.cohort import CohortDataset
+from study.datasets.people import Anatomy, make_patient
 from study.datasets.phantoms import PhantomDataset
 from study.errors import StudyError
 from study.evaluation.metrics import judge
-from study.evaluation.pair import Pair
+from study.evaluation.pair import Pair, align_pair
+from study.methods.branch_ends import BranchEnds
 from study.methods.cpd import Cpd
+from study.methods.displacement_field import DisplacementPrior
+from study.methods.gaussian_process import GaussianProcess
 from study.methods.icp import Icp
 from study.methods.nonrigid_icp import NonrigidIcp, Stage
 from study.methods.skeleton_graph import SkeletonGraphMethod
 from study.methods.skeleton_graph_repaired import SkeletonGraphRepaired
 from study.methods.visible_surface import VisibleSurface
 from study.params import find_profile
+from study.phantom.planted import planted_deformation
+from study.phantom.sizes import MAX_SD
 from study.pipeline import register_aligned
 from study.registration import Method
 from study.seeds import named_rng
@@ -44,11 +53,18 @@ from study.skeleton.spline import NodeSpline
 PAIRS = (("ct1", 101), ("ct2", 102), ("ct3", 103), ("ct4", 104), ("ct5", 105), ("ct1", 106))
 # Six people do not tell settings 0.1 mm apart; the later grids have four more.
 MORE_PAIRS = (*PAIRS, ("ct2", 201), ("ct3", 202), ("ct4", 203), ("ct5", 204))
+# Of the field method: phantoms, phantoms over the whole published spread, deformations planted into real CTs, by the
+# CT and the seed of deformation and sweep. tools/bounds.py has others of the same three kinds.
+PHANTOMS = tuple((name, seed) for seed in (201, 202) for name in ("ct1", "ct2", "ct3"))
+FULL_SPREAD = tuple((name, seed) for seed in (401, 402, 403) for name in ("ct1", "ct2"))
+REAL = ("lidc-0001", "totalseg-example", "lung1", "lung2")
+PLANTED = tuple((person, 401) for person in REAL)
 WHOLE = "_whole"  # ends the tables of the whole tube
 GRIDS = (
     *(name + surface for name in ("icp", "nonrigid_icp", "cpd", "skeleton_graph") for surface in ("", WHOLE)),
     "skeleton_graph_repaired",
     "visible_surface",
+    "gaussian_process",
 )
 ON_MORE = ("skeleton_graph_repaired",)
 MEASURES = {  # column of the tables: metric
@@ -59,12 +75,59 @@ MEASURES = {  # column of the tables: metric
 }
 
 
-def development_pair(name: str, seed: int) -> Pair:
+@cache
+def development_pair(name: str, seed: int, max_sd: float = MAX_SD) -> Pair:
     """A pair of the phantoms of one cohort seed, its sweep drawn by that seed; its source is ``ct1@101``."""
     params = find_profile("full")
-    people = PhantomDataset("phantom", params, 0, load_manifest(), cohort_seed=seed)
+    people = PhantomDataset("phantom", params, 0, load_manifest(), cohort_seed=seed, max_sd=max_sd)
     patient = make_patient(people.anatomy("patient"), params, seed)
     return replace(people.pair(people.anatomy(name), patient), source=f"{name}@{seed}")
+
+
+def planted_pair(person: str, seed: int) -> Pair:
+    """A real CT, and a patient who is that person under a deformation of 5 to 9 mm; ``seed`` draws it and the sweep."""
+    params = find_profile("full")
+    source = CohortDataset("open", params, 0, load_manifest()).anatomy(person)
+    deform = planted_deformation(source.mesh.vertices, 5.0 + seed % 5, named_rng(seed, f"planted/{person}"))
+    name = f"{person}+dev{seed}"
+    moved = Anatomy(
+        name,
+        replace(source.mesh, vertices=deform.apply(source.mesh.vertices), name=name),
+        replace(source.cloud, points=deform.apply(source.cloud.points), name=f"ct:{name}"),
+        replace(source.waypoints, points=deform.apply(source.waypoints.points)),
+        planted=deform,
+    )
+    patient = make_patient(moved, params, seed)
+    pair = align_pair(
+        source.cloud, patient.cloud, source.waypoints.points, patient.labelled, names=(f"{person}@{seed}", name)
+    )
+    points, waypoints = (
+        patient.T_us_ras.apply(deform.apply(places)) for places in (source.cloud.points, source.waypoints.points)
+    )
+    return replace(pair, true_points=points, true_waypoints=waypoints, shift_mm=patient.shift_mm)
+
+
+def three_kinds(
+    phantoms: Iterable[tuple[str, int]], full_spread: Iterable[tuple[str, int]], planted: Iterable[tuple[str, int]]
+) -> list[Pair]:
+    """Development pairs of three kinds; one that the coarse alignment refuses is left out, and told."""
+    makers = [partial(development_pair, *one) for one in phantoms]
+    makers += [partial(development_pair, *one, float("inf")) for one in full_spread]
+    makers += [partial(planted_pair, *one) for one in planted]
+    pairs = []
+    for make in makers:
+        try:
+            pairs.append(make())
+        except StudyError as refused:
+            print(f"left out: {refused}", flush=True)
+    return pairs
+
+
+def people_for(name: str) -> list[Pair]:
+    """The development pairs of a grid."""
+    if name == "gaussian_process":
+        return three_kinds(PHANTOMS, FULL_SPREAD, PLANTED)
+    return [development_pair(*one) for one in (MORE_PAIRS if name in ON_MORE else PAIRS)]
 
 
 def scaled_steps(factor: float) -> tuple[Stage, ...]:
@@ -118,6 +181,18 @@ def grid(name: str) -> Iterator[Method]:
         for som in (BatchSomParams(lengths="hops"), BatchSomParams(winners="any")):
             yield SkeletonGraphRepaired(som, som)
         yield SkeletonGraphRepaired(smooth_every_epoch=False)
+    elif name == "gaussian_process":
+        smooths = ((6.5, 58.0), (10.0, 70.0), (14.0, 90.0))
+        for (smooth, length), local, worth in product(smooths, (1.6, 2.4), (130.0, 200.0)):
+            prior = DisplacementPrior(6.0, smooth_mm=smooth, smooth_length_mm=length, local_mm=local)
+            yield GaussianProcess(prior=prior, independent_points=worth)
+        middle = DisplacementPrior(6.0, smooth_mm=10.0, smooth_length_mm=70.0, local_mm=1.6)
+        yield GaussianProcess(prior=middle, independent_points=200.0, ends=BranchEnds(1.5, 4.0))
+        # Less left of pose and size, which the smooth bend can make up for.
+        for affine, worth in ((3.0, 200.0), (3.0, 130.0), (1.5, 200.0)):
+            yield GaussianProcess(prior=replace(middle, affine_mm=affine), independent_points=worth)
+        wide = DisplacementPrior(3.0, smooth_mm=14.0, smooth_length_mm=90.0, local_mm=2.4)
+        yield GaussianProcess(prior=wide, independent_points=130.0)
     elif name == "visible_surface":  # each tuned method on the whole tube and on its visible half
         for tuned in (Icp.tuned(), NonrigidIcp.tuned(), Cpd.tuned(), SkeletonGraphMethod.tuned()):
             yield tuned
@@ -194,10 +269,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results" / "tuning")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    wanted = MORE_PAIRS if set(options.methods) & set(ON_MORE) else PAIRS
-    everyone = [development_pair(name, seed) for name, seed in wanted]
     for name in options.methods:
-        pairs = everyone if name in ON_MORE else everyone[: len(PAIRS)]
+        pairs = people_for(name)
         visible = not name.endswith(WHOLE) and name != "visible_surface"
         summary = summarise(run_grid(grid(name), pairs, visible=visible))
         summary.to_csv(options.out / f"{name}.csv", index=False, lineterminator="\n")

@@ -1,9 +1,12 @@
 """The field method: each idea against its literal form, and what the whole promises beyond the contract."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+from oracles import check_tuned
 from scipy.spatial.distance import cdist
 
 import study
@@ -14,7 +17,12 @@ from study.errors import StudyError
 from study.methods.branch_ends import BranchEnds, branch_ends
 from study.methods.breathing import AXES, BreathingPrior
 from study.methods.displacement_field import DisplacementPrior
-from study.methods.gaussian_process import GaussianProcess, GaussianProcessRegistration
+from study.methods.gaussian_process import (
+    BOUND_MM,
+    BOUND_UNTIMED_MM,
+    GaussianProcess,
+    GaussianProcessRegistration,
+)
 from study.methods.one_way_shares import OneWayShares
 from study.methods.visible_surface import VisibleSurface
 from study.pipeline import register_aligned, run_method
@@ -75,12 +83,13 @@ def test_a_point_that_nothing_explains_is_an_outlier():
     assert total[1] == 0
 
 
-def test_breathing_is_smooth_in_time_and_axes_are_orthogonal():
+def test_breathing_swings_and_forgets_its_phase_and_axes_are_orthogonal():
     times = np.sort(RNG.uniform(100, 130, 300))
-    prior = BreathingPrior(length_s=0.7)
+    prior = BreathingPrior(period_s=4.0, memory_s=1.5)
     values = prior.basis(times).at(times)
-    literal = np.exp(-((times[:, None] - times) ** 2) / (2 * 0.7**2))
-    assert values @ values.T == pytest.approx(literal, abs=0.02)  # knots half a length apart
+    apart = times[:, None] - times
+    literal = np.exp(-(apart**2) / (2 * 1.5**2)) * np.cos(np.pi / 2 * apart)
+    assert values @ values.T == pytest.approx(literal, abs=0.02)  # eight knots a period
     np.testing.assert_allclose(AXES @ AXES.T, np.eye(3), atol=1e-12)
     assert AXES[1] @ [0, 1, 1] == pytest.approx(np.sqrt(2))  # up and to the front
 
@@ -100,6 +109,17 @@ def test_ends_pull_harder_outwards_and_are_the_outermost_points(front):
 def test_the_best_method_is_the_field_on_the_visible_surface():
     assert isinstance(BEST, VisibleSurface)
     assert BEST.method == GaussianProcess()
+
+
+def test_the_parameters_are_the_best_row_of_the_table():
+    check_tuned(GaussianProcess())
+
+
+def test_the_bounds_are_the_tables_and_cover_people_that_they_were_not_chosen_on():
+    table = pd.read_csv(Path(__file__).parents[2] / "results" / "tuning" / "bounds.csv").set_index("times")
+    assert table["bound_mm"].to_dict() == {True: BOUND_MM, False: BOUND_UNTIMED_MM}
+    assert (table["pairs_checked_on"] >= 12).all()
+    assert table["covers_checked"].between(0.90, 0.98).all()
 
 
 def bent(cloud: PointCloud) -> PointCloud:
@@ -141,11 +161,11 @@ def test_breathing_is_taken_off_the_target_where_its_points_have_times(front):
     assert errors[0] < 0.75 * errors[1]
     assert with_times.breath_mm is not None
     assert np.linalg.norm(with_times.breath_mm - moved, axis=1).mean() < 0.75 * np.linalg.norm(moved, axis=1).mean()
-    assert "breathing taken off" in with_times.stop_reason
+    assert "breathing is taken off" in with_times.stop_reason
     assert without.breath_mm is None
-    assert "without time stamps" in without.stop_reason
+    assert "carry no times" in without.stop_reason
     assert without.warnings == ()  # nothing is suspect
-    assert without.bounds(front.points[:3]) == pytest.approx(np.full(3, GaussianProcess().bound_mm[1]))
+    assert without.bounds(front.points[:3]) == pytest.approx(np.full(3, BOUND_UNTIMED_MM))
 
 
 def test_a_schedule_cut_short_says_so(front):
@@ -217,11 +237,10 @@ def test_points_of_no_part_play_no_part(front):
         lambda: GaussianProcess(steps=(0, 8)),
         lambda: GaussianProcess(n_nodes=2),
         lambda: GaussianProcess(independent_points=0.0),
-        lambda: GaussianProcess(bound_mm=(0.0, 1.0)),
         lambda: DisplacementPrior(smooth_length_mm=0.0),
         lambda: OneWayShares(outlier_share=0.0),
         lambda: BranchEnds(inwards_mm=-1.0),
-        lambda: BreathingPrior(length_s=0.0),
+        lambda: BreathingPrior(memory_s=0.0),
     ],
 )
 def test_parameters_that_mean_nothing_are_refused(wrong):

@@ -46,13 +46,16 @@ from study.evaluation.metrics import METRICS, Metric, Unit, judge
 from study.evaluation.pair import TRUTH, Pair, align_pair, in_order, perfect
 from study.evaluation.poses import PoseCheck, PoseTrial, check_pose, random_pose, try_poses
 from study.evaluation.statistics import population_sd
+from study.evaluation.way import LEFT_OUT, ON_THE_WAY, Step, walk, way_to_best
 from study.evaluation.waypoints import intercostal_waypoints
 
 __all__ = [
     "AS_AUTHORS",
     "CLAIMS",
     "GRAPH",
+    "LEFT_OUT",
     "METRICS",
+    "ON_THE_WAY",
     "PROTOCOL",
     "RIGID",
     "STEPS",
@@ -70,6 +73,7 @@ __all__ = [
     "PoseCheck",
     "PoseTrial",
     "Scanned",
+    "Step",
     "Unit",
     "ablate",
     "agreement_summary",
@@ -102,6 +106,8 @@ __all__ = [
     "truth_floor",
     "truth_free_measures",
     "try_poses",
+    "walk",
+    "way_to_best",
     "waypoint_errors_mm",
     "with_minutes",
 ]

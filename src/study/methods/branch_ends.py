@@ -25,7 +25,7 @@ class BranchEnds:
     """
 
     outwards_mm: float = 1.5
-    inwards_mm: float = 4.0
+    inwards_mm: float = 2.5
 
     def __post_init__(self) -> None:
         if not (self.outwards_mm > 0 and self.inwards_mm > 0):

@@ -12,31 +12,36 @@ from study.types import Floats
 
 # Rows: outwards, cranio-ventral and across both, in chest coordinates (left, up, front).
 AXES: Floats = np.array([[1.0, 0.0, 0.0], [0.0, np.sqrt(0.5), np.sqrt(0.5)], [0.0, -np.sqrt(0.5), np.sqrt(0.5)]])
-_KNOTS_PER_LENGTH = 1.4
+_KNOTS_PER_PERIOD = 8
 _MAX_KNOTS = 300
 
 
 @dataclass(frozen=True)
 class BreathingPrior:
-    """A displacement of the whole wall that changes smoothly with time: a Gaussian process, about a mean of 0.
+    """A displacement of the whole wall in time: a Gaussian process about 0 that swings as quiet breathing does.
 
-    Quiet breathing moves the wall 3-5 mm upwards and forwards. Nothing is assumed of its period or its shape.
+    Quiet breathing moves the wall 3-5 mm upwards and forwards, 12 to 20 times a minute. The process remembers its phase
+    for less than a breath, so that breaths may differ in length, depth and shape. It has next to nothing of a period
+    of a line of the sweep or longer: that would be shape.
 
     Attributes:
         along_mm: standard deviation along the cranio-ventral direction.
         aside_mm: in each direction across that.
-        length_s: of its changes.
+        period_s: of a typical breath.
+        memory_s: after which a breath may come early or late.
     """
 
     along_mm: float = 1.4
     aside_mm: float = 0.5
-    length_s: float = 0.7
+    period_s: float = 4.0
+    memory_s: float = 1.5
 
     def __post_init__(self) -> None:
-        if not (self.along_mm > 0 and self.aside_mm > 0 and self.length_s > 0):
+        if not min(self.along_mm, self.aside_mm, self.period_s, self.memory_s) > 0:
             raise StudyError(
-                "breathing: expected along_mm, aside_mm and length_s > 0, "
-                f"got {self.along_mm}, {self.aside_mm} and {self.length_s}; quiet breathing has 1.4, 0.5 and 0.7"
+                "breathing: expected along_mm, aside_mm, period_s and memory_s > 0, got "
+                f"{self.along_mm}, {self.aside_mm}, {self.period_s} and {self.memory_s}; BreathingPrior() is quiet "
+                "breathing"
             )
 
     @property
@@ -47,14 +52,15 @@ class BreathingPrior:
     def basis(self, times_s: Floats) -> BreathingBasis:
         """What the process can do during a sweep with points at times (n,) s."""
         first, last = float(times_s.min()), float(times_s.max())
-        count = int(np.ceil((last - first) / self.length_s * _KNOTS_PER_LENGTH)) + 1
+        count = int(np.ceil((last - first) / self.period_s * _KNOTS_PER_PERIOD)) + 1
         knots = np.linspace(first, last, min(count, _MAX_KNOTS))
         covariance = self.correlation(knots, knots) + 1e-6 * np.eye(len(knots))
         return BreathingBasis(self, knots, cholesky(covariance, lower=True))
 
     def correlation(self, one: Floats, other: Floats) -> Floats:
         """Between times (n,) and (m,) s."""
-        values: Floats = np.exp(-(((one[:, None] - other) / self.length_s) ** 2) / 2)
+        apart = one[:, None] - other
+        values: Floats = np.exp(-((apart / self.memory_s) ** 2) / 2) * np.cos(2 * np.pi * apart / self.period_s)
         return values
 
 

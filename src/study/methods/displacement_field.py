@@ -31,10 +31,10 @@ class DisplacementPrior:
         local_left_mm, local_up_mm: its lengths along and across the cartilages.
     """
 
-    affine_mm: float = 3.0
+    affine_mm: float = 1.5
     affine_length_mm: float = 80.0
-    smooth_mm: float = 6.5
-    smooth_length_mm: float = 58.0
+    smooth_mm: float = 10.0
+    smooth_length_mm: float = 70.0
     local_mm: float = 1.6
     local_left_mm: float = 25.0
     local_up_mm: float = 18.0

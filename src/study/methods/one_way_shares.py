@@ -51,11 +51,11 @@ class OneWayShares:
         """
         m, n = len(moved), len(target)
         near = min(_NEAR, m)
-        # Beyond the cut the distance is infinite and the index m: no share, and any index will do.
         distance, index = KDTree(moved).query(target, k=range(1, near + 1), distance_upper_bound=_CUT * width_mm)
-        index = np.minimum(index, m - 1)
-        density = np.exp(-((distance / width_mm) ** 2) / 2)
-        density[moved_parts[index] != target_parts[:, None]] *= self.other_part
+        row, rank = np.nonzero(index < m)  # beyond the cut the index is m
+        column = index[row, rank]
+        density = np.exp(-((distance[row, rank] / width_mm) ** 2) / 2)
+        density[moved_parts[column] != target_parts[row]] *= self.other_part
         outlier = self.outlier_share / _VOLUME_MM3 * m * (2 * np.pi * width_mm**2) ** 1.5 / (1 - self.outlier_share)
-        shares = density / (density.sum(axis=1, keepdims=True) + outlier)
-        return csr_array((shares.ravel(), index.ravel(), np.arange(0, n * near + 1, near)), shape=(n, m))
+        shares = density / (np.bincount(row, density, n) + outlier)[row]
+        return csr_array((shares, (row, column)), shape=(n, m))
