@@ -30,6 +30,7 @@ from study.datasets.phantoms import PhantomDataset
 from study.errors import StudyError
 from study.evaluation.metrics import judge
 from study.evaluation.pair import Pair, align_pair
+from study.methods.bcpd import Bcpd
 from study.methods.branch_ends import BranchEnds
 from study.methods.cpd import Cpd
 from study.methods.displacement_field import DisplacementPrior
@@ -62,6 +63,7 @@ PLANTED = tuple((person, 401) for person in REAL)
 WHOLE = "_whole"  # ends the tables of the whole tube
 GRIDS = (
     *(name + surface for name in ("icp", "nonrigid_icp", "cpd", "skeleton_graph") for surface in ("", WHOLE)),
+    "bcpd",
     "skeleton_graph_repaired",
     "visible_surface",
     "gaussian_process",
@@ -160,6 +162,13 @@ def grid(name: str) -> Iterator[Method]:
         yield Cpd()
         for beta, alpha, share in product((20.0, 30.0, 50.0, 80.0, 120.0), (0.02, 0.2, 2.0), (0.0, 0.1)):
             yield Cpd(beta_mm=beta, alpha=alpha, outlier_share=share)
+    elif name == "bcpd":
+        yield Bcpd()
+        for beta, lam, share in product((0.6, 0.9, 1.2, 1.8, 2.5), (20.0, 60.0, 200.0), (0.0, 0.1)):
+            yield Bcpd(beta=beta, lam=lam, outlier_share=share)
+        # What its author advises for clouds that are roughly aligned: one scale for both, a narrower start.
+        for beta, lam in product((0.9, 1.2, 1.8, 2.5), (20.0, 60.0, 200.0)):
+            yield Bcpd(beta=beta, lam=lam, gamma=0.3, normalise="source")
     elif name == "skeleton_graph":
         yield SkeletonGraphMethod()
         for radius, schedule in product((2.0, 3.0, 4.0, 5.0), ("constant", "linear")):
@@ -170,11 +179,11 @@ def grid(name: str) -> Iterator[Method]:
             yield SkeletonGraphMethod(som, som, n_reg, "hops", blend_weights="inverse_distance")
     elif name == "skeleton_graph_repaired":
         yield SkeletonGraphRepaired()
-        for end, smoothing in product((2.0, 3.0, 4.0), (1000.0, 3000.0, 10_000.0)):
+        for end, smoothing in product((1.5, 2.0, 3.0, 4.0), (1000.0, 3000.0, 10_000.0)):
             if SkeletonGraphRepaired(*radii(20.0, end), NodeSpline(smoothing=smoothing)) != SkeletonGraphRepaired():
                 yield SkeletonGraphRepaired(*radii(20.0, end), NodeSpline(smoothing=smoothing))
         for start in (10.0, 40.0):
-            yield SkeletonGraphRepaired(*radii(start, 3.0))
+            yield SkeletonGraphRepaired(*radii(start, BatchSomParams().end_radius_mm))
         for smoothing in (10.0, 30.0, 100.0):
             yield SkeletonGraphRepaired(spline=NodeSpline("linear", smoothing))
         # Each change to the paper's method taken back.

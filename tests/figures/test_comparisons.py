@@ -50,16 +50,29 @@ def paired() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def steps() -> pd.DataFrame:
+    rows = [("as published", 4.0, 1.8), ("visible surface", 2.5, 1.7), ("field", 1.6, 1.2)]
+    return pd.DataFrame(
+        [
+            {"change": change, "case": f"ct{k}", "true": true + k, "in_plane": plane}
+            for change, true, plane in rows
+            for k in range(3)
+        ]
+    )
+
+
 EXAMPLES: dict[str, Callable[[], Figure]] = {
     "sensitivity": lambda: figures.sensitivity(choices()),
     "error_budget": lambda: figures.error_budget(budget()),
     "paired_differences": lambda: figures.paired_differences(paired(), "skeleton_graph", "Waypoint error"),
+    "way": lambda: figures.way(steps()),
 }
 REFUSED: dict[str, Callable[[], Figure]] = {
     "empty choices": lambda: figures.sensitivity(choices().iloc[:0]),
     "no published option": lambda: figures.sensitivity(choices()[lambda t: t["role"] != "paper"]),
     "nothing paired": lambda: figures.sensitivity(choices()[lambda t: (t["role"] == "paper") ^ (t["case"] == "ct1")]),
     "budget without paths": lambda: figures.error_budget(budget()[lambda t: t["metric"] != "waypoint_error"]),
+    "a way without steps": lambda: figures.way(steps().iloc[:0]),
     "no differences": lambda: figures.paired_differences(paired().iloc[:0], "icp", "Waypoint error"),
 }
 
@@ -104,3 +117,13 @@ def test_error_budget_keeps_the_order_of_sources_and_starts_at_zero() -> None:
     bottom, top = left.get_ylim()
     assert bottom > top  # the first source on top
     assert left.get_xlim()[0] == right.get_xlim()[0] == 0
+
+
+def test_the_way_has_a_row_a_step_and_its_mean() -> None:
+    figure = figures.way(steps())
+    shown = texts(figure)
+    assert all(name in shown for name in ("as published", "+ visible surface", "+ field"))
+    line = figure.axes[0].lines[0]
+    np.testing.assert_allclose(line.get_xdata(), [5.0, 3.5, 2.6])
+    np.testing.assert_array_equal(line.get_ydata(), [0, 1, 2])
+    assert len(figures.way(steps().drop(columns="in_plane")).axes[0].lines) == 1

@@ -108,7 +108,7 @@ def test_a_cloud_without_labels_is_refused(start):
         {"max_rest": -1},
         {"at_rest_mm": np.nan},
         {"end_radius_mm": 0.0},
-        {"start_radius_mm": 2.0},
+        {"start_radius_mm": 1.0},
         {"winners": "all"},
         {"lengths": "euclidean"},
     ],

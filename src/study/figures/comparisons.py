@@ -20,7 +20,7 @@ from study.figures.rows import method_row, name_rows, spread, stripe_rows
 from study.figures.style import DARK, GREY, SIMULATED, MethodStyle, method_style
 from study.types import Floats
 
-__all__ = ["error_budget", "paired_differences", "sensitivity"]
+__all__ = ["error_budget", "paired_differences", "sensitivity", "way"]
 
 _YARDSTICK_COLOUR = "#e8e8e8"
 
@@ -207,4 +207,40 @@ def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str
     how = f"{label} better ←  → worse.  Dot: a case; bar: mean ± population SD over cases"
     figure.supxlabel(how, fontsize=8, color=DARK)
     name_rows(panels[0], [method_style(method).label for method in methods])
+    return figure
+
+
+def way(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
+    """Step by step from one method to another: a row a step, the error of each pair and their mean, joined downwards.
+
+    Args:
+        df: columns ``change``, ``case`` and ``true`` (mean true waypoint error, mm), steps in their order; ``in_plane``
+            where it is known.
+        note: where the patient is from.
+
+    Raises:
+        StudyError: no step.
+    """
+    require_columns(df, ("change", "case", "true"), "steps, a row a step and case")
+    changes = list(dict.fromkeys(df["change"]))
+    figure = new_figure(1.5 + 0.36 * len(changes), f"Mean true waypoint error, step by step ({note})")
+    ax = figure.subplots()
+    stripe_rows(ax, len(changes))
+    for column, colour, marker, label in (
+        ("true", "#0077BB", "o", "in space"),
+        ("in_plane", "#EE7733", "s", "in plane"),
+    ):
+        if column not in df:
+            continue
+        means = df.groupby("change", sort=False)[column].mean()
+        ax.plot(means, range(len(changes)), color=colour, lw=1, zorder=2)
+        ax.scatter(means, range(len(changes)), c=colour, marker=marker, s=42, zorder=3, label=f"{label}, mean")
+        rows = [changes.index(change) + 0.22 for change in df["change"]]
+        ax.scatter(df[column], rows, c=colour, s=8, alpha=0.6, lw=0, zorder=3)
+    name_rows(ax, [change if k == 0 else f"+ {change}" for k, change in enumerate(changes)])
+    ax.set_xlim(left=0)
+    ax.set_xlabel("mm; small dots: single pairs", fontsize=8)
+    ax.legend(fontsize=8, loc="lower right")
+    ax.grid(axis="x", alpha=0.3)
+    plain(ax)
     return figure

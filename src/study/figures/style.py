@@ -106,6 +106,7 @@ METHOD_STYLE: Mapping[str, MethodStyle] = {
     **_styles("icp", "ICP", "#0077BB", "o"),
     **_styles("nonrigid_icp", "Non-rigid ICP", "#EE7733", "s"),
     **_styles("cpd", "CPD", "#009988", "^"),
+    **_styles("bcpd", "Bayesian CPD", "#AA4499", "<"),
     **_styles("skeleton_graph", "Skeleton graph", "#CC3311", "D"),
     "skeleton_graph_authors": MethodStyle("Skeleton graph, authors' code", "#882255", "d", tuned=False),
     "skeleton_graph_repaired": MethodStyle("Skeleton graph, repaired", "#CC3311", "H", tuned=True, visible=True),

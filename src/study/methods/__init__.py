@@ -28,6 +28,7 @@ A method is a frozen dataclass of its parameters, and another setting is another
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from study.methods.bcpd import Bcpd
 from study.methods.coarse_only import CoarseOnly
 from study.methods.cpd import Cpd
 from study.methods.gaussian_process import GaussianProcess, GaussianProcessRegistration
@@ -41,6 +42,7 @@ from study.registration import FieldRegistration, Method
 __all__ = [
     "BEST_METHOD",
     "METHODS",
+    "Bcpd",
     "CoarseOnly",
     "Cpd",
     "FieldRegistration",
@@ -77,6 +79,8 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "cpd_tuned_whole": Cpd.tuned_whole(),
         "skeleton_graph_tuned_whole": SkeletonGraphMethod.tuned_whole(),
         "skeleton_graph_repaired": VisibleSurface(SkeletonGraphRepaired()),
+        "bcpd": Bcpd(),
+        "bcpd_tuned": VisibleSurface(Bcpd.tuned()),
         "gaussian_process": VisibleSurface(GaussianProcess()),
     }
 )

@@ -41,7 +41,7 @@ class BatchSomParams:
 
     epochs: int = 20
     start_radius_mm: float = 20.0
-    end_radius_mm: float = 3.0
+    end_radius_mm: float = 2.0
     winners: Winners = "own_part"
     lengths: Lengths = "geodesic"
     at_rest_mm: float = 0.05
