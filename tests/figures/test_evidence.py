@@ -69,6 +69,14 @@ def test_robustness_has_a_panel_a_kind_with_what_was_refused_and_failed() -> Non
     np.testing.assert_allclose(medians, [[2, 3, 4], [2.6, 3.6, 4.6], [2.3, 3.3, 4.3]])  # as METHODS has them
 
 
+def test_clouds_that_fail_every_method_are_counted_once() -> None:
+    lost = levels()
+    lost.loc[lost["level"] == lost["level"].max(), "failed"] = 6
+    shown = texts(figures.robustness(lost))
+    assert shown.count("3\nrefused\n6\nlost") == shown.count("6\nlost") > 0
+    assert "×6" not in shown
+
+
 def test_choices_have_a_row_each_with_the_change_of_every_measure() -> None:
     figure = figures.choices(tried())
     shown = texts(figure)

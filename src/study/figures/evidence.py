@@ -88,6 +88,7 @@ def robustness(summary: pd.DataFrame, metric: str = "true_waypoint_error") -> Fi
         Patch(color=_BAND_COLOUR, label=f"5th-95th percentile of {draws} draws"),
         Line2D([], [], color=DARK, lw=2.5, label="95 % interval of the median"),
         Line2D([], [], ls="", label="n refused: draws that were started by hand"),
+        Line2D([], [], ls="", label="n lost: draws without a cloud, for every method"),
         Line2D([], [], ls="", label="×n: draws of a method that failed"),
     ]
     below(figure, handles, 4)
@@ -100,6 +101,7 @@ def _dashes(method: str) -> str:
 
 def _draw_kind(ax: Axes, rows: pd.DataFrame, methods: list[str], top: float) -> None:
     levels = list(dict.fromkeys(rows["level"]))
+    alike = rows.groupby("level")["failed"].nunique() == 1  # clouds that cannot be made fail every method
     for k, method in enumerate(methods):
         mine = rows[rows["method"] == method].set_index("level").reindex(levels)
         style = method_style(method)
@@ -117,13 +119,16 @@ def _draw_kind(ax: Axes, rows: pd.DataFrame, methods: list[str], top: float) -> 
             mfc=style.face,
             mec=style.colour,
         )
-        for place, failed in zip(x, mine["failed"], strict=True):
-            if failed:
+        for place, level, failed in zip(x, levels, mine["failed"], strict=True):
+            if failed and not alike[level]:
                 ax.text(place, 0.86 * top, f"×{failed:.0f}", color=style.colour, fontsize=7, ha="center", va="center")
     for place, level in enumerate(levels):
-        by_hand = rows.loc[rows["level"] == level, "by_hand"].max()
-        if by_hand:
-            ax.text(place, 0.985 * top, f"{by_hand}\nrefused", color=DARK, fontsize=7, ha="center", va="top")
+        mine = rows[rows["level"] == level]
+        by_hand, failed = mine["by_hand"].max(), mine["failed"].max()
+        told = [f"{by_hand}\nrefused"] if by_hand else []
+        told += [f"{failed}\nlost"] if failed and alike[level] else []
+        if told:
+            ax.text(place, 0.985 * top, "\n".join(told), color=DARK, fontsize=7, ha="center", va="top")
     ax.set_xticks(range(len(levels)), [f"{level:g}" for level in levels])
     ax.set_xlim(-0.5, len(levels) - 0.5)
     ax.set_ylim(0, top)
