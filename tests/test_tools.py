@@ -212,6 +212,12 @@ def test_the_field_method_is_tuned_on_people_of_three_kinds_and_every_row_is_rec
     assert min(len(tune.PAIRS), len(tune.FULL_SPREAD), len(tune.PLANTED)) >= 4
 
 
+@pytest.mark.parametrize("name", ["bcpd", "skeleton_graph_repaired"])
+def test_every_row_of_a_grid_of_one_surface_is_recorded(tune: ModuleType, name: str) -> None:
+    recorded = pd.read_csv(ROOT / "results" / "tuning" / f"{name}.csv")
+    assert sorted(recorded["setting"]) == list(range(len(list(tune.grid(name)))))
+
+
 def test_a_grid_runs_on_the_surface_that_its_table_is_named_after(
     tune: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
