@@ -14,7 +14,7 @@ from study.errors import StudyError
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "notebooks").glob("[0-9]*.py"))
 PARAMETERS = {"dataset": "phantom", "profile": "quick", "seed": 0}
-EXPECTED = ("00", "10", "15", "20", "30", "40", "50", "60", "65")
+EXPECTED = ("00", "10", "15", "20", "30", "40", "45", "50", "60", "65", "66")
 
 spec = importlib.util.spec_from_file_location("notebook_tool", ROOT / "tools" / "notebooks.py")
 tool = importlib.util.module_from_spec(spec)
@@ -46,7 +46,7 @@ def test_the_notebooks_are_all_there():
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 def test_every_notebook_has_the_same_parameters_and_refuses_others_by_name(source):
     namespace = start(source)
-    assert namespace["dataset"] in ("phantom", "open")
+    assert namespace["dataset"] in ("phantom", "open", "population")
     assert (namespace["profile"], namespace["seed"]) == ("full", 0)
     with pytest.raises(StudyError, match="unknown datset"):
         start(source, datset="open")
@@ -70,7 +70,8 @@ def test_every_notebook_opens_with_its_question_and_says_what_is_simulated(sourc
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 def test_every_notebook_runs_on_the_quick_profile(source, tmp_path):
     done = tmp_path / f"{source.stem}.ipynb"
-    tool.execute(source, done, PARAMETERS)  # its own last cell asserts its claim
+    parameters = {**PARAMETERS, **({"dataset": "population"} if source.stem.startswith("66") else {})}
+    tool.execute(source, done, parameters)  # its own last cell asserts its claim
     cells = [cell for cell in nbformat.read(done, as_version=4).cells if cell.cell_type == "code"]
     assert all(cell.execution_count for cell in cells)
     pictures = [output for cell in cells for output in cell.outputs if "image/png" in output.get("data", {})]
