@@ -34,12 +34,13 @@ def test_without_errors_the_cloud_is_the_visible_surface(chest, record, seen):
     assert set(true_parts(result.cloud.points, chest)) == set(range(9))
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_with_every_error_the_cloud_lies_within_1_8_mm(mean_error_mm, seed):
-    # Calibration alone is 1 mm; the rest is mostly breathing, of which a small chest meets few breaths. Over 24 seeds
-    # the mean is 1.2 mm and the largest 1.7.
-    error = mean_error_mm(SweepErrors(), seed)
-    assert 0.3 < error < 1.8
+def test_with_every_error_the_cloud_lies_within_1_5_mm_on_average(mean_error_mm):
+    # Calibration alone is 1 mm; the rest is mostly breathing, of which a small chest meets few breaths: over 24 seeds
+    # the mean is 1.2 mm and the largest 1.7, since errors that point the same way add up.
+    errors = [mean_error_mm(SweepErrors(), seed) for seed in range(6)]
+    assert 0.3 < min(errors)
+    assert np.mean(errors) < 1.5
+    assert max(errors) < 1.8
 
 
 def test_uncorrected_latency_shifts_by_speed_times_lag(record):
