@@ -38,7 +38,7 @@ def test_with_every_error_the_cloud_lies_within_1_5_mm_on_average(mean_error_mm)
     # Calibration alone is 1 mm; the rest is mostly breathing, of which a small chest meets few breaths: over 24 seeds
     # the mean is 1.2 mm and the largest 1.7, since errors that point the same way add up.
     errors = [mean_error_mm(SweepErrors(), seed) for seed in range(6)]
-    assert 0.3 < min(errors)
+    assert min(errors) > 0.3
     assert np.mean(errors) < 1.5
     assert max(errors) < 1.8
 
