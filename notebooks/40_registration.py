@@ -4,7 +4,7 @@
 # One CT, one patient, one coarse alignment, and every method of the study from there: sections III-C, III-D and IV of
 # the paper. The skeleton graph moves each CT point by a blend of the local motions of its nearest nodes (Eqs. 3 and 4);
 # the baselines are ICP, Amberg's non-rigid ICP and coherent point drift. A planned path is then carried to the patient
-# by the sphere of section III-D (Fig. 4a), in the same way for every method.
+# by the sphere of section III-D (Fig. 4a), or by the field of a method that has one.
 #
 # **What is real and what is not.** In the phantom both people are synthetic. In `open` the CTs are real people, in
 # `planted` a real CT is deformed by a known map. The ultrasound cloud is simulated in every case, by a virtual tracked
@@ -73,7 +73,8 @@ pd.DataFrame(
 # over a sheet: a method that only asks for small distances pulls the tube flat onto the sheet, back side and all.
 
 # %%
-drawn = [name for name in results if not name.endswith(("_visible", "_whole"))]  # those of the other cells look alike
+# Those of the other cells, and a few more, look like one that is drawn.
+drawn = [name for name in results if not name.endswith(("_visible", "_whole", "icp_tuned", "bcpd"))]
 figures.registration_grid({name: results[name].warped for name in drawn}, us, T_us_chest=T_us_chest)
 
 # %% [markdown]
@@ -99,8 +100,9 @@ surface.round(2)
 # %% [markdown]
 # ## The path, carried over
 # The 20 waypoints lie in the intercostal spaces, where there is no cartilage to register; each is moved by the rigid
-# motion of the CT points within the sphere around it. Hollow circles are the waypoints that the protocol defines on the
-# patient's own cloud (k-means parts of each cartilage, midpoints between neighbours); magenta lines are the errors.
+# motion of the CT points within the sphere around it, or by the method's field where it has one. Hollow circles are the
+# waypoints that the protocol defines on the patient's own cloud (k-means parts of each cartilage, midpoints between
+# neighbours); magenta lines are the errors.
 
 # %%
 moved = {name: judgement.moved for name, judgement in judged.items()}
