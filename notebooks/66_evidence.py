@@ -53,7 +53,7 @@ pd.DataFrame(
 
 # %%
 lost = pd.concat([rows.assign(dataset=name) for name, rows in refused.items()])
-lost["reason"] = lost["reason"].str.replace(r"^us:\S+: |; crop to .*", "", regex=True)
+lost["reason"] = lost["reason"].astype(str).str.replace(r"^us:\S+: |; crop to .*", "", regex=True)
 lost.groupby(["dataset", "reason"])["target"].agg(["size", lambda names: ", ".join(names)]).set_axis(
     ["pairs", "patients"], axis=1
 )
