@@ -13,12 +13,13 @@ import argparse
 import resource
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from study import BEST_METHOD, METHODS, phantom, register_pair
@@ -109,12 +110,16 @@ def of_points(n: int, method: str) -> dict[str, Any]:
     }
 
 
+def alone(measure: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+    """What a function returns from a process that has done nothing before."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(measure, *arguments).result()
+
+
 def by_points(most: int) -> pd.DataFrame:
     """Cost against the number of points, each in a process of its own; ``slope`` of log time against log points."""
     sizes = [n for n in (1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if 1000 < n <= most]
-    rows = [
-        Parallel(n_jobs=2, max_nbytes=None)([delayed(of_points)(n, m)])[0] for m in (PAPERS, BEST_METHOD) for n in sizes
-    ]
+    rows = [alone(of_points, n, method) for method in (PAPERS, BEST_METHOD) for n in sizes]
     table = pd.DataFrame(rows)
     logs = np.log(table[["points", "seconds"]])
     slope = logs.groupby(table["method"]).diff()
