@@ -1,4 +1,4 @@
-"""Seconds of ``register_pair`` on 9,000 and 6,600 points, and the compiled SOM kernel against literal Eq. 2.
+"""The compiled SOM kernel against literal Eq. 2; `scale.py` has what whole registrations cost.
 
     python benchmarks/registration_speed.py
 
@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from study import METHODS, phantom, register_pair
+from study import phantom
 from study.params import PHANTOM_SEED
 from study.skeleton.graph import SkeletonGraph
 from study.skeleton.som import SomParams, fit_som, neighbourhood
@@ -21,6 +21,7 @@ from study.types import PointCloud
 
 
 def processor_seconds(run: Callable[[], object], repeats: int = 3) -> float:
+    """The median processor time (s) of some calls, after one that compiles and loads."""
     run()
     times = []
     for _ in range(repeats):
@@ -38,12 +39,7 @@ def literal_epoch(nodes: np.ndarray, points: np.ndarray, theta: np.ndarray, rate
 
 def main() -> None:
     ct = phantom.reference_cloud(phantom.draw_subject("ct1", PHANTOM_SEED), 9000, np.random.default_rng(0))
-    patient = phantom.draw_subject("patient", PHANTOM_SEED)
-    us = phantom.anterior_cloud(patient, 6600, 0.5, 0, np.random.default_rng(1))
     with threadpool_limits(1):
-        for name in METHODS:
-            seconds = processor_seconds(lambda name=name: register_pair(ct.points, us.points, name), 1)
-            print(f"register_pair {name:22s} {seconds:6.2f} s")
         rng = np.random.default_rng(2)
         nodes, hops = rng.normal(scale=40.0, size=(246, 3)), rng.integers(0, 20, (246, 246))
         graph = SkeletonGraph(nodes, np.array([[i, i + 1] for i in range(245)]), np.zeros(246, dtype=np.int64))

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from registration_speed import processor_seconds
 from threadpoolctl import threadpool_limits
 
 from study import BEST_METHOD, METHODS, phantom, register_pair
@@ -49,21 +50,10 @@ def clouds(ct_points: int = CT_POINTS, us_points: int = US_POINTS) -> tuple[Floa
     return ct, phantom.anterior_cloud(patient, us_points, 0.5, 0, np.random.default_rng(1)).points
 
 
-def cost(run: Callable[[], object], repeats: int = 1) -> float:
-    """The least processor time (s) of some calls, after one that compiles and loads."""
-    run()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return min(times)
-
-
 def by_method() -> pd.DataFrame:
     """`register_pair` with every method, coarse alignment included."""
     ct, us = clouds()
-    seconds = {name: cost(lambda name=name: register_pair(ct, us, name), 3) for name in METHODS}
+    seconds = {name: processor_seconds(lambda name=name: register_pair(ct, us, name), 3) for name in METHODS}
     table = pd.DataFrame({"method": list(seconds), "seconds": list(seconds.values())})
     return table.assign(ratio=table["seconds"] / seconds[PAPERS])
 
@@ -75,14 +65,14 @@ def by_stage() -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for name in (PAPERS, BEST_METHOD):
         result = register_aligned(alignment, METHODS[name], named_rng(0, "bench"))
-        whole = cost(lambda name=name: register_pair(ct, us, name), 3)
+        whole = processor_seconds(lambda name=name: register_pair(ct, us, name), 3)
         stages = {
-            "chests found": cost(lambda: (find_chest(ct), find_chest(us)), 3),
-            "clouds thinned, chests found": cost(lambda: (_even_chest(ct), _even_chest(us)), 3),
-            "method, judged by itself": cost(
+            "chests found": processor_seconds(lambda: (find_chest(ct), find_chest(us)), 3),
+            "clouds thinned, chests found": processor_seconds(lambda: (_even_chest(ct), _even_chest(us)), 3),
+            "method, judged by itself": processor_seconds(
                 lambda name=name: register_aligned(alignment, METHODS[name], named_rng(0, "bench")), 3
             ),
-            "quality": cost(lambda result=result: measure_quality(alignment, result.warped), 3),
+            "quality": processor_seconds(lambda result=result: measure_quality(alignment, result.warped), 3),
         }
         rows += [
             {"method": name, "stage": stage, "seconds": s, "share": s / whole}
@@ -133,7 +123,7 @@ def by_frames() -> pd.DataFrame:
     for factor in (1.0, 0.5, 0.25):
         probe = Probe(speed_mm_s=Probe.speed_mm_s * factor)
         sweep = simulate_sweep(mesh, (0.0, 1.0, 0.0), SweepErrors(), np.random.default_rng(0), probe=probe)
-        rows.append({"frames": sweep.n_frames, "seconds": cost(lambda sweep=sweep: sweep_cloud(sweep))})
+        rows.append({"frames": sweep.n_frames, "seconds": processor_seconds(lambda sweep=sweep: sweep_cloud(sweep))})
     return with_slope(pd.DataFrame(rows), "frames")
 
 
@@ -159,7 +149,7 @@ def by_voxels() -> pd.DataFrame:
         rows.append(
             {
                 "voxels": int(np.prod(labels.shape)),
-                "seconds": cost(lambda labels=labels: surface(parts_from_labels(labels, ids))),
+                "seconds": processor_seconds(lambda labels=labels: surface(parts_from_labels(labels, ids))),
             }
         )
     return with_slope(pd.DataFrame(rows), "voxels")

@@ -34,13 +34,15 @@ def test_without_errors_the_cloud_is_the_visible_surface(chest, record, seen):
     assert set(true_parts(result.cloud.points, chest)) == set(range(9))
 
 
-def test_with_every_error_the_cloud_lies_within_1_5_mm_on_average(mean_error_mm):
-    # Calibration alone is 1 mm; the rest is mostly breathing, of which a small chest meets few breaths: over 24 seeds
-    # the mean is 1.2 mm and the largest 1.7, since errors that point the same way add up.
-    errors = [mean_error_mm(SweepErrors(), seed) for seed in range(6)]
-    assert min(errors) > 0.3
-    assert np.mean(errors) < 1.5
-    assert max(errors) < 1.8
+@pytest.mark.parametrize("seed", range(6))
+def test_with_every_error_but_breathing_the_cloud_lies_within_1_5_mm(mean_error_mm, seed):
+    error = mean_error_mm(dataclasses.replace(SweepErrors(), breathing_mm=0.0), seed)
+    assert 0.3 < error < 1.5
+
+
+def test_with_every_error_it_does_so_on_average(mean_error_mm):
+    # A small chest meets few breaths, and single sweeps lie farther off: `benchmarks/coarse_margins.py` counts them.
+    assert np.mean([mean_error_mm(SweepErrors(), seed) for seed in range(6)]) < 1.5
 
 
 def test_uncorrected_latency_shifts_by_speed_times_lag(record):
