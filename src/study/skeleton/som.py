@@ -112,15 +112,19 @@ def _epoch(nodes, points, classes, barred, first, near, theta, rate):  # type: i
     m = nodes.shape[1]
     x, y, z = nodes[0], nodes[1], nodes[2]
     apart = np.empty(m)
+    # Floats of 0 or more are ordered as the integers of their bits; unlike the floats' own least, which must mind NaN,
+    # that of integers is found several at a time.
+    bits = apart.view(np.int64)
     for k in range(points.shape[0]):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
         bar = barred[classes[k]]
+        least = np.int64(np.iinfo(np.int64).max)
         for s in range(m):
             apart[s] = (px - x[s]) ** 2 + (py - y[s]) ** 2 + (pz - z[s]) ** 2 + bar[s]
+            least = min(least, bits[s])
         winner = 0
-        for s in range(1, m):
-            if apart[s] < apart[winner]:
-                winner = s
+        while bits[winner] != least:
+            winner += 1
         for j in range(first[winner], first[winner + 1]):  # Eq. 2
             s, step = near[j], theta[j] * rate
             x[s] += step * (px - x[s])
