@@ -78,8 +78,8 @@ table.loc[best_first].rename_axis("mean over pairs, mm")
 #   counting a fiftieth 1.28; a breath that remembers its phase for longer 1.29, a larger one 1.25; a smooth bend of
 #   90 mm 1.28; a larger or smaller bend of single cartilages 1.29 and 1.27; longer ones, of 40 mm, 1.24; a breath that
 #   widens the chest in proportion to the distance from the sternum 1.25.
-# - At 16 steps: a last width of 1 mm 1.34, of 0.7 mm 1.46, of 2 mm 1.36; with 1 mm and twice the points 1.26. US
-#   points that say half as much 1.31, twice as much 1.38.
+# - At 16 steps: a last width of 1 mm 1.34, of 0.7 mm 1.46, of 2 mm 1.36; with 1 mm and twice the points 1.26.
+#   US points that say half as much 1.31, twice as much 1.38.
 # - 24 steps, bends of 40 mm and less breath aside: 1.25, and 1.24 with more breath along its way. Three runs on 11 pairs
 #   of fresh seeds (2100-2121): 1.16 the method as it is, 1.15 and 1.18 those two. Phantoms lose, planted deformations
 #   gain, by more than either mean. None is kept.
