@@ -80,9 +80,9 @@ table.loc[best_first].rename_axis("mean over pairs, mm")
 #   widens the chest in proportion to the distance from the sternum 1.25.
 # - At 16 steps: a last width of 1 mm 1.34, of 0.7 mm 1.46, of 2 mm 1.36; with 1 mm and twice the points 1.26.
 #   US points that say half as much 1.31, twice as much 1.38.
-# - 24 steps, bends of 40 mm and less breath aside: 1.25, and 1.24 with more breath along its way. Three runs on 11 pairs
-#   of fresh seeds (2100-2121): 1.16 the method as it is, 1.15 and 1.18 those two. Phantoms lose, planted deformations
-#   gain, by more than either mean. None is kept.
+# - 24 steps, bends of 40 mm and less breath aside: 1.25, and 1.24 with more breath along its way. On 11 pairs of fresh
+#   seeds (2100-2121) the method has 1.16, those two 1.15 and 1.18: phantoms lose, planted deformations gain. Neither
+#   is kept.
 #
 # Less than a fifth of what is left comes from where the fit starts: started from the true places themselves, with forty
 # steps, it leaves them by 1.09 to 1.17 mm, kind by kind, mostly outwards along the cartilages and in depth; from where
