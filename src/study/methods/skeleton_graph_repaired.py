@@ -27,9 +27,9 @@ class SkeletonGraphRepaired:
 
     What differs from `SkeletonGraphMethod`: a point is won by nodes of its own part only; all points at a time, not
     drawn ones (`study.skeleton.batch_som`), with a neighbourhood along the graph in mm or, which is better on
-    development people, in hops as the paper's; a smooth field in place of local rigid motions that tear between three nodes, and
-    waypoints carried by it. The field also smooths the second map while it runs: nodes slide along a cartilage together
-    or not at all.
+    development people, in hops as the paper's; a smooth field in place of local rigid motions that tear between three
+    nodes, and waypoints carried by it. The field also smooths the second map while it runs: nodes slide along a
+    cartilage together or not at all.
 
     Attributes:
         ct_som: schedule of the map from the template to the CT cloud.
