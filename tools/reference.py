@@ -2,9 +2,9 @@
 
     python tools/reference.py [--runs results/runs]
 
-Old and new are compared first (`study compare`); where a number moved, a draft is put under "Unreleased" of CHANGELOG.md,
-for whoever moved it to say why. Runs that are not of the code of now, or not as they were made, are refused: nothing is
-changed then.
+Old and new are compared first (`study compare`); where a number moved, a draft is put under "Unreleased" of
+CHANGELOG.md, for whoever moved it to say why. Runs that are not of the code of now, or not as they were made, are
+refused: nothing is changed then.
 """
 
 from __future__ import annotations

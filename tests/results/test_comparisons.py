@@ -93,8 +93,10 @@ def test_a_missing_row_a_new_one_and_a_turned_order_are_told(reference, tmp_path
     assert found.exit_code == 1
     text = found.markdown()
     assert "## Rows that only the reference has: 1" in text
-    assert "phantom, hd: by mean" in text
-    assert "; now " in text
+    assert "| phantom, hd, places 1 to 2 by mean" in text
+    turned = next(line for line in text.splitlines() if "phantom, hd, places" in line)
+    _, _, old, new, _ = (cell.strip() for cell in turned.split("|"))
+    assert {old, new} == {"skeleton_graph < icp", "icp < skeleton_graph"}
     suites = {suite.name: suite for suite in JUnitXml.fromstring(found.junit())}
     failed = [case.name for case in suites["phantom"] if case.result]
     assert "order of the methods and claims" in failed
@@ -138,4 +140,5 @@ def test_the_reference_agrees_with_itself_and_half_a_millimetre_turns_claims(tmp
     assert compare_all(REFERENCE / "phantom", REFERENCE / "phantom").exit_code == 0
     found = compare_all(REFERENCE / "phantom", tmp_path)
     assert found.exit_code == 1
-    assert "phantom, hd: by mean" in found.markdown()
+    assert "| phantom, hd, places " in found.markdown()
+    assert any(told.startswith("phantom, hd: by mean") for told in found.compared()["."].upsets)

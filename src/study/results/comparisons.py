@@ -67,7 +67,7 @@ class Comparisons:
             lines += ["## Cannot be compared", "", *(f"- `{name}`: {why}" for name, why in self.refused().items()), ""]
         upsets = [told for part in self.compared().values() for told in part.upsets]
         if upsets:
-            lines += ["## Orders and claims that turned", "", *(f"- {told}" for told in upsets), ""]
+            lines += ["## Orders and claims that turned", "", *_table(pd.DataFrame(map(_old_and_new, upsets))), ""]
         for title, frame, columns in (
             ("Means beyond tolerance", self._all("shifts"), _MEANS),
             ("Values beyond tolerance", self._all("differences"), _VALUES),
@@ -125,7 +125,7 @@ class Comparisons:
                     "largest difference / its tolerance": f"{part.largest:.3g}",
                 }
             rows.append(row)
-        return pd.DataFrame(rows).fillna("–")
+        return pd.DataFrame(rows, dtype=object).fillna("–")
 
     def _all(self, what: str) -> pd.DataFrame:
         """Rows of a kind of all data sets, the largest multiple of a tolerance first."""
@@ -209,6 +209,19 @@ def _table(frame: pd.DataFrame) -> list[str]:
     numbers = frame.select_dtypes("float").columns
     text = frame.assign(**{name: frame[name].map("{:.6g}".format) for name in numbers})
     return str(text.astype(str).to_markdown(index=False, disable_numparse=True)).splitlines()
+
+
+def _old_and_new(upset: str) -> dict[str, str]:
+    """A turned order or claim side by side; of an order, the places that changed alone."""
+    head, _, now = upset.partition("; now ")
+    about, _, was = head.rpartition(": ")
+    before, after = was.removeprefix("by mean ").split(" < "), now.split(" < ")
+    changed = [k for k, pair in enumerate(zip(before, after, strict=False)) if pair[0] != pair[1]]
+    if len(before) == len(after) > 1 and changed:
+        part = slice(changed[0], changed[-1] + 1)
+        about += f", places {part.start + 1} to {part.stop} by mean"
+        was, now = " < ".join(before[part]), " < ".join(after[part])
+    return {"what": about, "old": was, "new": now}
 
 
 def _content(part: Comparison) -> dict[str, Any]:
