@@ -21,6 +21,7 @@ from study.results.compare import compare
 from study.results.metrics_csv import read_metrics, write_metrics
 
 METHODS = ("icp", "coarse")
+EARLIER = {"code_sha256": "0" * 64, "commit": "abcdef0123456", "uncommitted_changes": "", "versions": {"numpy": "1"}}
 Capture = pytest.CaptureFixture[str]
 
 
@@ -71,7 +72,7 @@ def test_a_folder_is_complete_and_repeated_to_the_byte(
 def test_other_numbers_differ_and_other_code_is_said(
     edited: Callable[..., Path], tmp_path: Path, capsys: Capture
 ) -> None:
-    folder = edited(lambda record: record.update(code_sha256="0" * 64, commit="abcdef0123456", versions={"numpy": "1"}))
+    folder = edited(lambda record: record.update(EARLIER))
     rows = read_metrics(folder / "metrics.csv")
     rows.loc[rows["metric"] == "hd", "value"] += 0.5
     write_metrics(rows.to_dict("records"), folder / "metrics.csv")
