@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from study.files.atomic import json_text
 
@@ -55,7 +56,7 @@ def crate_text(folder: Path, names: Iterable[str], record: Mapping[str, Any]) ->
         for name in ("dataset", "seed")
     ]
     inputs = [
-        {"@id": f"#input/{name}", "@type": "CreativeWork", "name": name, "identifier": f"sha256:{sha256}"}
+        {"@id": f"#input/{quote(name)}", "@type": "CreativeWork", "name": name, "identifier": f"sha256:{sha256}"}
         for name, sha256 in sorted(record["inputs_sha256"].items())
     ]
     results = [{"@id": file["@id"]} for file in files if {"@id": file["@id"]} not in given]
@@ -118,7 +119,12 @@ def _makers(record: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _file(folder: Path, name: str) -> dict[str, Any]:
     path = folder / name
-    entity = {"@id": name, "@type": "File", "name": name, "encodingFormat": _FORMATS.get(path.suffix, "text/plain")}
+    entity = {
+        "@id": quote(name),
+        "@type": "File",
+        "name": name,
+        "encodingFormat": _FORMATS.get(path.suffix, "text/plain"),
+    }
     if name in _TOLD:
         entity["description"] = _TOLD[name]
     if name not in _TIMED:
