@@ -3,8 +3,10 @@
 import json
 import shutil
 from datetime import UTC, datetime, timedelta
+from importlib.resources import files
 
 import pytest
+import requests
 from result_rows import some_rows
 from rocrate.rocrate import ROCrate
 
@@ -57,6 +59,39 @@ def test_the_library_reads_it_and_finds_every_file(made):
     }
     assert {entity.id for entity in action["result"]} == described - {"parameters.json", "manifest.yaml"}
     assert action["startTime"] == action["endTime"] == STARTED.isoformat()
+
+
+def validation(folder, monkeypatch):
+    """What the profile's validator finds; the JSON-LD context that it asks for comes from the library's own copy."""
+    from rocrate_validator import services
+    from rocrate_validator.models import Severity
+
+    context = files("rocrate").joinpath("data/ro-crate.jsonld").read_bytes()
+
+    def answer(_session, _method, url, **_options):
+        response = requests.Response()
+        response.status_code, response.url, response._content = 200, url, context
+        response.headers["Content-Type"] = "application/ld+json"
+        return response
+
+    monkeypatch.setattr(requests.Session, "request", answer)
+    settings = services.ValidationSettings(
+        rocrate_uri=str(folder), profile_identifier="process-run-crate-0.5", requirement_severity=Severity.REQUIRED
+    )
+    return services.validate(settings)
+
+
+def test_the_validator_of_the_profile_finds_no_fault(made, monkeypatch):
+    pytest.importorskip("rocrate_validator", reason="roc-validator is not installed")
+    with monkeypatch.context() as patch:
+        found = validation(made.folder, patch)
+        assert [issue.message for issue in found.get_issues()] == []
+        assert found.passed()
+    content = json.loads((made.folder / CRATE).read_text(encoding="utf-8"))
+    action = next(entity for entity in content["@graph"] if entity["@type"] == "CreateAction")
+    del action["instrument"]
+    (made.folder / CRATE).write_text(json.dumps(content), encoding="utf-8")
+    assert not validation(made.folder, monkeypatch).passed()
 
 
 def test_every_name_leads_somewhere(made):

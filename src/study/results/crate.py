@@ -94,6 +94,8 @@ def _root(record: Mapping[str, Any], files: Iterable[Mapping[str, Any]]) -> dict
         "description": "Ultrasound-CT registrations of costal cartilage: one data set, every pair, every method.",
         "datePublished": record["finished"],
         "license": {"@id": LICENCE},
+        "author": {"@id": "#authors"},
+        "publisher": {"@id": "#authors"},
         "conformsTo": {"@id": PROFILE},
         "hasPart": [{"@id": file["@id"]} for file in files],
         "mentions": {"@id": "#run"},
