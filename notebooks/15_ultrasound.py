@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from study import datasets, evaluation, figures, params, seeds, ultrasound
+from study.types import RigidTransform
 
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
@@ -86,7 +87,9 @@ pd.DataFrame(
 # %% [markdown]
 # ## One frame
 # What the probe meets first under each of its columns, as an annotator would draw it: a thin line along the upper
-# surface. There is no B-mode picture behind it; speckle is not simulated, because only the line goes on.
+# surface. The picture behind it looks like B-mode and is simulated from the CT in the plane of the frame, to show what
+# an annotator would look at: cartilage dark between its upper surface and the pleura, bone with a shadow. Only the
+# line goes on. A planted deformation has no CT of its own, so no picture either.
 
 # %%
 source, target = data.pairs()[0]
@@ -101,9 +104,18 @@ def sweep_with(errors, repeat=None):
 
 
 sweep = sweep_with(ultrasound.SweepErrors())
-fullest = int(sweep.masks.any(axis=1).sum(axis=1).argmax())
+poses, _, tracked = sweep.frame_poses()
+fullest = int((sweep.masks.any(axis=1).sum(axis=1) * tracked).argmax())
+picture = None
+if patient.anatomy.image is not None:
+    T_us_image = RigidTransform.from_matrix(poses[fullest]) @ sweep.T_probe_image
+    plane = patient.T_us_ras.inverse @ T_us_image
+    shape, speckle = sweep.masks.shape[1:], seeds.named_rng(seed, "us/speckle")
+    picture = ultrasound.frame_of(
+        patient.anatomy.image, patient.anatomy.mask, plane, shape, sweep.pixel_spacing_mm[0], speckle
+    )
 figures.frame_with_mask(
-    sweep.masks[fullest], sweep.pixel_spacing_mm, title=f"mask of frame {fullest} of {sweep.n_frames} (simulated)"
+    sweep.masks[fullest], sweep.pixel_spacing_mm, picture, f"frame {fullest} of {sweep.n_frames} (simulated)"
 )
 
 # %% [markdown]
@@ -113,7 +125,6 @@ figures.frame_with_mask(
 # front of the cartilages only, and has gaps between lines.
 
 # %%
-poses, _, tracked = sweep.frame_poses()
 edges = sweep.T_probe_image.apply([[0, 0, 0], [sweep.pixel_spacing_mm[0] * (sweep.masks.shape[2] - 1), 0, 0]])
 transducer = np.einsum("fij,kj->fki", poses[:, :3, :3], edges) + poses[:, None, :3, 3]
 figures.sweep_in_space(
@@ -168,9 +179,9 @@ pd.DataFrame(ultrasound.error_table()).set_index(["source", "field"])
 # ## What each error costs
 # Each row of the figure is one source alone; the last two are all together. Left: how far the cloud lies from the
 # surface that a probe can see. Right: how far the 20 waypoints, carried from one CT, end from where they are defined on
-# the patient, after a whole registration, coarse alignment included, in the feature plane, by method: the four as
-# published or shipped, and tuned on the visible surface. Small dots are single sweeps of the same patient, and every
-# row of one sweep shares its random draws.
+# the patient, after a whole registration, coarse alignment included, in the feature plane; a panel a method, as
+# published or shipped and tuned on the visible surface. A line spans the sweeps of the same patient, and every row of
+# one sweep shares its random draws.
 # Where the coarse alignment refuses a cloud (the reasons follow below), the methods are started by hand: from the
 # alignment of the sweep without errors, with the true parts as labels, so that the row still says what the error costs.
 
@@ -190,7 +201,7 @@ budget = evaluation.error_budget(
 in_plane = budget.rows[budget.rows["metric"] != "waypoint_error"].replace(
     {"metric": {"waypoint_error_inplane": "waypoint_error"}}
 )
-figures.error_budget(in_plane, note=f"{figures.SIMULATED}; waypoints in the feature plane")
+figures.error_budget(in_plane, note=f"by the paper's protocol, in the feature plane; {figures.SIMULATED}")
 
 # %% [markdown]
 # What the errors do to the cloud. The distance of a cloud to a surface hides a shift along that surface, so `points

@@ -113,7 +113,7 @@ counts[counts[["by_hand", "failed"]].any(axis=1)].rename(columns={"by_hand": "re
 
 # %%
 choices = evidence.table("sensitivity")
-figures.choices(choices)
+display(*(figures.choices(choices, page) for page in figures.choice_pages(choices)))
 
 # %% [markdown]
 # ### What tears the cloud, and what mends it
