@@ -6,9 +6,9 @@
 # the baselines are ICP, Amberg's non-rigid ICP and coherent point drift. A planned path is then carried to the patient
 # by the sphere of section III-D (Fig. 4a), or by the field of a method that has one.
 #
-# **What is real and what is not.** In the phantom both people are synthetic. In `open`, of which two pairs are drawn
-# in any case, the CTs are real people; in `planted` a real CT is deformed by a known map. The ultrasound cloud is simulated in every case, by a virtual tracked
-# sweep over the patient's surface.
+# **What is real and what is not.** In the phantom both people are synthetic. In `open`, of which two pairs are drawn in
+# any case, the CTs are real people; in `planted` a real CT is deformed by a known map. The ultrasound cloud is
+# simulated in every case, by a virtual tracked sweep over the patient's surface.
 
 # %% tags=["parameters"]
 dataset = "phantom"  # phantom, open or planted
@@ -113,9 +113,9 @@ figures.transferred_path(us, protocol, {name: moved[name] for name in drawn}, T_
 
 # %% [markdown]
 # ## Real people: a typical and a worst pair
-# The paper's Fig. 4a on CTs of real people, `open`, each registered to another one in a simulated sweep. Of all pairs in
-# the committed reference, the typical one has the median and the worst the largest mean waypoint error of the published
-# graph by the paper's protocol. What is true between two people is not known.
+# The paper's Fig. 4a on CTs of real people, `open`, each registered to another one in a simulated sweep. Of all pairs
+# in the committed reference, the typical one has the median and the worst the largest mean waypoint error of the
+# published graph by the paper's protocol. What is true between two people is not known.
 
 # %%
 people = datasets.find_dataset("open", params.find_profile(profile), seed)

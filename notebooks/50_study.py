@@ -50,7 +50,7 @@ if run.has_truth:
     true = per_pair.loc["true_waypoint_error"].mean().drop(evaluation.TRUTH)
     order = ", ".join(f"`{name}` {value:.2f}" for name, value in true[FOUR].sort_values().items())
     told.append(
-        f"- Waypoint error by the truth: {order} mm; smallest of all methods: `{true.idxmin()}` with {true.min():.2f} mm."
+        f"- Waypoint error by the truth: {order} mm; smallest of all: `{true.idxmin()}` with {true.min():.2f} mm."
     )
 Markdown("\n".join(told))
 

@@ -260,7 +260,10 @@ def _sensitivity(plan: EvidencePlan) -> _Part:
         summary = sensitivity_summary(found)
         failed = found.loc[found["reason"] != "", ["choice", "option", "people", "seed", "reason"]]
         tables = {"summary": summary, "draws": wide.reset_index(), "refused": failed.drop_duplicates()}
-        pages = {f"{SENSITIVITY}_{k + 1}": choices(summary, only) for k, only in enumerate(choice_pages(summary))}
+        pages = {
+            f"{SENSITIVITY}{f'_{k + 1}' * (k > 0)}": choices(summary, only)
+            for k, only in enumerate(choice_pages(summary))
+        }
         return tables, picture_files(pages)
 
     parameters = {
