@@ -8,7 +8,7 @@
 #
 # **Everything here is simulated.** No tracked sweep over cartilage is public, so a virtual probe scans a surface that
 # we know: that of a synthetic person (`phantom`), of a real CT (`open`) or of a real CT under a known deformation
-# (`planted`). The code that makes the cloud does not know that; a real sweep takes the same road (see the README).
+# (`planted`). The code that makes the cloud does not know that; a real sweep takes the same road (see `docs/use.md`).
 
 # %% tags=["parameters"]
 dataset = "phantom"  # phantom, open or planted

@@ -123,9 +123,7 @@ display(overview("waypoint_error", results.paper_waypoints()))
 
 # %%
 drawn = {
-    f"against_{metric}": figures.paired_differences(
-        evaluation.differences(methods_only, metric), GRAPH, evaluation.METRICS[metric].title
-    )
+    f"against_{metric}": figures.paired_differences(evaluation.differences(methods_only, metric), GRAPH, metric)
     for metric in ("waypoint_error", "hd")
 }
 display(*drawn.values())

@@ -240,7 +240,7 @@ def biomarker(wall: FrontWall, mask: Volume, frames: Mapping[str, Floats], size_
     for ax in top:
         _draw_wall(ax, wall, extent, (-30.0, 110.0))
     ends = _junctions(mask)
-    top[0].scatter(*ends.T, s=130, fc="none", ec="#F0E442", lw=1.8)
+    top[0].scatter(ends[:, 0], ends[:, 1], s=130, fc="none", ec="#F0E442", lw=1.8)
     look(top[0], "front", extent, "a  front of the chest on CT; ringed: junctions of rib and cartilage", on_dark=True)
     _fill(top[1], mask)
     middle = float(ends[:, 0].mean())
@@ -271,7 +271,7 @@ def _draw_wall(ax: Axes, wall: FrontWall, extent: Floats, window_hu: tuple[float
 def _seen_of(mask: Volume, margin_mm: float) -> Floats:
     """(2, 2) mm, corners of what is shown: across and up the page."""
     require(np.flatnonzero(mask.values >= 0), f"labelled voxels of {mask.name}")
-    flat = (mask.values >= 0).any(axis=1)
+    flat: Bools = (mask.values >= 0).any(axis=1)
     seen = [(-1) ** (a == 0) * _grid_mm(mask, a)[flat.any(axis=b)] for a, b in ((0, 1), (2, 0))]
     return np.array([[one.min() - margin_mm for one in seen], [one.max() + margin_mm for one in seen]])
 

@@ -155,7 +155,8 @@ def error_budget(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
         for k, method in enumerate(methods):
             aside = 0.4 * ((k + 0.5) / len(methods) - 0.5)
             _strip(ax, errors, path[path["method"] == method], aside, method_style(method))
-        ax.sharex(panels[1])
+        if ax is not panels[1]:
+            ax.sharex(panels[1])
     for ax, title in zip(panels, ("the cloud itself", *families), strict=True):
         stripe_rows(ax, len(errors))
         ax.set_xlim(0, None)
@@ -198,7 +199,7 @@ def difference_rows(df: pd.DataFrame, reference: str, *, note: str = SIMULATED) 
     metrics, datasets = (list(dict.fromkeys(df[name])) for name in ("metric", "dataset"))
     methods = in_order(df["against"])
     label = method_style(reference).label
-    figure = new_figure(1.6 + 0.34 * len(methods), f"{label} minus each other method ({note})")
+    figure = new_figure(1.6 + 0.34 * len(methods), f"{label} minus each other method; left of 0 it is better ({note})")
     panels = np.atleast_1d(figure.subplots(1, len(metrics), sharey=True))
     for ax, metric in zip(panels, metrics, strict=True):
         stripe_rows(ax, len(methods))
@@ -211,15 +212,14 @@ def difference_rows(df: pd.DataFrame, reference: str, *, note: str = SIMULATED) 
                 ax.plot(row["value"], y, marker=marker, ms=5, mec=colour, mfc="white" if row["is_tie"] else colour)
         ax.axvline(0, color=DARK, lw=1)
         ax.grid(axis="x", alpha=0.3)
-        plain(ax, fill(judged_by(metric), 38))
-        ax.set_xlabel("mm", fontsize=8)
+        plain(ax, fill(judged_by(metric), 28))
+        ax.set_xlabel("mean over pairs (mm), 95 % over people", fontsize=8)
     name_rows(panels[0], [method_style(method).label for method in methods])
     marks = [
         Line2D([], [], marker=marker, color=colour, label=dataset)
         for dataset, (colour, marker) in zip(datasets, DATASET_STYLE * len(datasets), strict=False)
     ]
     marks.append(Line2D([], [], ls="", marker="o", mfc="white", mec=DARK, label="hollow: a tie"))
-    figure.supxlabel(f"{label} better ←  → worse; mean over pairs, 95 % interval over people", fontsize=8, color=DARK)
     below(figure, marks, 4)
     return figure
 
@@ -231,7 +231,7 @@ def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str
         df: columns ``dataset``, ``method`` (the other), ``difference`` (mm, ``reference`` minus the other, a row a
             case).
         reference: the method compared.
-        what: what the difference is of, for the title.
+        what: what the difference is of: a name in ``METRICS``, or words for the title.
         note: where the patient is from.
 
     Raises:
@@ -240,7 +240,7 @@ def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str
     require_columns(df, ("dataset", "method", "difference"), "paired differences, a row a case")
     datasets, methods = list(dict.fromkeys(df["dataset"])), in_order(df["method"])
     label = method_style(reference).label
-    figure = new_figure(1.6 + 0.36 * len(methods), f"{what}: {label} minus each other method ({note})")
+    figure = new_figure(1.6 + 0.36 * len(methods), f"{judged_by(what)}: {label} minus each other method ({note})")
     panels = np.atleast_1d(figure.subplots(1, len(datasets), sharex=True, sharey=True))
     for ax, dataset in zip(panels, datasets, strict=True):
         mine = df[df["dataset"] == dataset]

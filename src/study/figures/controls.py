@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from study.evaluation.metrics import METRICS
 from study.figures.canvas import View, below, bounds, dots, look, new_figure, plain, project, require, require_columns
-from study.figures.rows import name_rows, spread, stripe_rows
+from study.figures.rows import judged_by, name_rows, spread, stripe_rows
 from study.figures.style import CT_COLOUR, DARK, DATASET_STYLE, GREY, SIMULATED, US_COLOUR, lighter
 from study.types import Bools, Floats, RigidTransform
 
@@ -48,7 +48,7 @@ def truth_floor(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     panels = figure.subplots(n_rows, 3, sharey=True, squeeze=False)
     for ax, metric in zip(panels.flat, metrics, strict=False):
         _draw_steps(ax, steps, df[df["metric"] == metric])
-        plain(ax, METRICS[metric].title)
+        plain(ax, fill(judged_by(metric), 36))
         ax.set_xlabel("mm", fontsize=8)
     for ax in panels.flat[len(metrics) :]:
         ax.set_visible(False)
