@@ -26,6 +26,7 @@ from study.types import PointCloud
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 folder = CHECKOUT / "samples"
 CT, US, WAYPOINTS = folder / "ct.ply", folder / "us.ply", folder / "waypoints.csv"
+FRONT = (0.9370, 0.0917, 0.3370)  # from the chest to the probe, in the frame of US; None where it is not known
 OUT = CHECKOUT / "results" / "trials" / "your_own_data"
 
 # %% [markdown]
@@ -51,9 +52,11 @@ pd.DataFrame(
 # %% [markdown]
 # ## Register
 # `study.BEST_METHOD` has the smallest true error in this study. What cannot be a chest is refused here, with a reason.
+# The direction to the probe, which a tracker knows, tells front from back; without it the shape alone has to decide,
+# and the sample is refused: try it.
 
 # %%
-pair = study.register_pair(ct, us, method=study.BEST_METHOD, seed=seed, times=times)
+pair = study.register_pair(ct, us, method=study.BEST_METHOD, seed=seed, front=FRONT, times=times)
 pair
 
 # %% [markdown]
@@ -68,7 +71,7 @@ print(f"{len(pair.warnings)} warnings; converged: {pair.converged} ({pair.stop_r
 pd.Series(vars(pair.quality)).to_frame("quality")
 
 # %%
-T_us_chest = find_chest(PointCloud(us, "us")).T_cloud_chest  # so that the picture looks from the front
+T_us_chest = find_chest(PointCloud(us, "us", front=FRONT)).T_cloud_chest  # so that the picture looks from the front
 title = "The CT cloud where it was registered to, on the ultrasound cloud (grey)"
 figures.registration_grid({study.BEST_METHOD: pair.warped}, us, T_us_chest=T_us_chest, title=title)
 

@@ -66,7 +66,7 @@ def test_a_new_method_looks_like_no_listed_one() -> None:
 
 def test_new_methods_are_drawn_among_the_others_and_named() -> None:
     methods = (*METHODS, "bayesian_cpd", "bayesian_cpd_tuned")
-    figure = figures.hd_bars(metrics(methods))
+    figure = figures.waypoint_boxes(metrics(methods))
     assert "bayesian cpd, tuned" in texts(figure)
     edges = {tuple(bar.get_edgecolor()[:3]) for bar in figure.axes[0].patches}
     assert to_rgb(figures.method_style("bayesian_cpd").colour) in edges

@@ -153,11 +153,13 @@ def score_maps(views: Mapping[str, ScoreView]) -> Figure:
         row[0].set_ylabel("y in the plane (mm)", fontsize=8)
         row[2].plot(view.angles_deg, view.best, marker="o", ms=4, color=US_COLOUR)
         row[2].axvline(view.angle_deg, color=_EDGE_COLOUR, lw=1.2)
-        row[2].set(ylim=(0, 1.02), xlabel="rotation of the template (°)")
+        row[2].set_ylim(0, 1.02)
+        row[2].set_xlabel("rotation of the template (°)", fontsize=8)
         row[2].grid(alpha=0.25)
         plain(row[2], "largest $F_k$ at each rotation")
     bar = figure.colorbar(drawn, ax=grid[:, 1], shrink=min(0.9, 3.0 / figure.get_figheight()), aspect=20, pad=0.02)
     bar.set_label("share of the rectangle that is covered", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
     return figure
 
 

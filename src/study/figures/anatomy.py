@@ -271,7 +271,7 @@ def _draw_wall(ax: Axes, wall: FrontWall, extent: Floats, window_hu: tuple[float
 def _seen_of(mask: Volume, margin_mm: float) -> Floats:
     """(2, 2) mm, corners of what is shown: across and up the page."""
     require(np.flatnonzero(mask.values >= 0), f"labelled voxels of {mask.name}")
-    flat: Bools = (mask.values >= 0).any(axis=1)
+    flat = np.asarray((mask.values >= 0).any(axis=1))
     seen = [(-1) ** (a == 0) * _grid_mm(mask, a)[flat.any(axis=b)] for a, b in ((0, 1), (2, 0))]
     return np.array([[one.min() - margin_mm for one in seen], [one.max() + margin_mm for one in seen]])
 
