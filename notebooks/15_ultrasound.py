@@ -89,7 +89,7 @@ pd.DataFrame(
 # What the probe meets first under each of its columns, as an annotator would draw it: a thin line along the upper
 # surface. The picture behind it looks like B-mode and is simulated from the CT in the plane of the frame, to show what
 # an annotator would look at: cartilage dark between its upper surface and the pleura, bone with a shadow. Only the
-# line goes on. A planted deformation has no CT of its own, so no picture either.
+# line goes on. This frame is of a sweep without errors. A planted deformation has no CT of its own, so no picture.
 
 # %%
 source, target = data.pairs()[0]
@@ -104,19 +104,19 @@ def sweep_with(errors, repeat=None):
 
 
 sweep = sweep_with(ultrasound.SweepErrors())
-poses, _, tracked = sweep.frame_poses()
-fullest = int((sweep.masks.any(axis=1).sum(axis=1) * tracked).argmax())
+clean = sweep_with(ultrasound.SweepErrors.none())  # else picture and line would not lie over each other
+poses, _, tracked = clean.frame_poses()
+fullest = int((clean.masks.any(axis=1).sum(axis=1) * tracked).argmax())
 picture = None
 if patient.anatomy.image is not None:
-    T_us_image = RigidTransform.from_matrix(poses[fullest]) @ sweep.T_probe_image
+    T_us_image = RigidTransform.from_matrix(poses[fullest]) @ clean.T_probe_image
     plane = patient.T_us_ras.inverse @ T_us_image
-    shape, speckle = sweep.masks.shape[1:], seeds.named_rng(seed, "us/speckle")
+    shape, speckle = clean.masks.shape[1:], seeds.named_rng(seed, "us/speckle")
     picture = ultrasound.frame_of(
-        patient.anatomy.image, patient.anatomy.mask, plane, shape, sweep.pixel_spacing_mm[0], speckle
+        patient.anatomy.image, patient.anatomy.mask, plane, shape, clean.pixel_spacing_mm[0], speckle
     )
-figures.frame_with_mask(
-    sweep.masks[fullest], sweep.pixel_spacing_mm, picture, f"frame {fullest} of {sweep.n_frames} (simulated)"
-)
+title = f"frame {fullest} of {clean.n_frames}{', B-mode-like' * (picture is not None)}, simulated"
+figures.frame_with_mask(clean.masks[fullest], clean.pixel_spacing_mm, picture, title)
 
 # %% [markdown]
 # ## The sweep in space
@@ -125,6 +125,7 @@ figures.frame_with_mask(
 # front of the cartilages only, and has gaps between lines.
 
 # %%
+poses, _, tracked = sweep.frame_poses()
 edges = sweep.T_probe_image.apply([[0, 0, 0], [sweep.pixel_spacing_mm[0] * (sweep.masks.shape[2] - 1), 0, 0]])
 transducer = np.einsum("fij,kj->fki", poses[:, :3, :3], edges) + poses[:, None, :3, 3]
 figures.sweep_in_space(

@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 from IPython.display import Markdown
 
-from study import BEST_METHOD, METHODS, datasets, evaluation, figures, params, pipeline, results
+from study import METHODS, datasets, evaluation, figures, methods, params, pipeline, results
 
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
@@ -76,7 +76,8 @@ pd.DataFrame(
 
 # %%
 # The others look like one that is drawn.
-drawn = ["coarse", "icp", "nonrigid_icp", "cpd", "skeleton_graph", "cpd_tuned", "skeleton_graph_repaired", BEST_METHOD]
+drawn = ["coarse", "icp", "nonrigid_icp", "cpd", "skeleton_graph", "cpd_tuned", "skeleton_graph_repaired"]
+drawn.append(methods.BEST_METHOD)
 figures.registration_grid({name: answers[name].warped for name in drawn}, us, T_us_chest=T_us_chest)
 
 # %% [markdown]
@@ -124,7 +125,7 @@ for what, names in zip(("typical", "worst"), results.typical_and_worst("open", p
     case = people.pair(people.anatomy(names[0]), someone := people.patient(names[1]))
     found = {
         name: pipeline.register_aligned(case.alignment, METHODS[name], people.rng(f"{case.name}/{name}"))
-        for name in ("icp", "cpd", "skeleton_graph", BEST_METHOD)
+        for name in ("icp", "cpd", "skeleton_graph", methods.BEST_METHOD)
     }
     views[f"{what}: {names[0]} to {names[1]}"] = figures.PairView(
         target=case.alignment.target.cloud.points,

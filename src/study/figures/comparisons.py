@@ -213,7 +213,7 @@ def difference_rows(df: pd.DataFrame, reference: str, *, note: str = SIMULATED) 
         ax.axvline(0, color=DARK, lw=1)
         ax.grid(axis="x", alpha=0.3)
         plain(ax, fill(judged_by(metric), 28))
-        ax.set_xlabel("mean over pairs (mm), 95 % over people", fontsize=8)
+        ax.set_xlabel("mean and 95 % interval (mm)", fontsize=8)
     name_rows(panels[0], [method_style(method).label for method in methods])
     marks = [
         Line2D([], [], marker=marker, color=colour, label=dataset)
