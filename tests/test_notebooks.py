@@ -14,7 +14,7 @@ from study.errors import StudyError
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "notebooks").glob("[0-9]*.py"))
 PARAMETERS = {"dataset": "phantom", "profile": "quick", "seed": 0}
-EXPECTED = ("00", "10", "15", "20", "30", "40", "45", "50", "60", "65", "66")
+EXPECTED = ("00", "10", "15", "20", "30", "40", "45", "50", "60", "65", "66", "70")
 
 spec = importlib.util.spec_from_file_location("notebook_tool", ROOT / "tools" / "notebooks.py")
 tool = importlib.util.module_from_spec(spec)

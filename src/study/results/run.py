@@ -254,7 +254,10 @@ class Run:
         return sorted(self.folder.glob("hd_table*.md"))
 
     def keep_figures(self, pictures: Mapping[str, bytes]) -> list[str]:
-        """Write PNG pictures of this run beside its metrics, and their hashes into its provenance; their file names.
+        """Write pictures of this run beside its metrics, and their hashes into its provenance; their file names.
+
+        Args:
+            pictures: by file name, as `study.figures.picture_files` gives them.
 
         Raises:
             StudyError: the folder holds another run by now, or one that was altered.
@@ -360,10 +363,10 @@ def newest(dataset: str, profile: str, seed: int) -> Run | None:
 
 
 def keep_pictures(folder: Path, pictures: Mapping[str, bytes]) -> list[str]:
-    """Write PNG pictures into a folder; their file names."""
+    """Write pictures, by file name, into a folder; their file names."""
     for name, content in pictures.items():
-        write_bytes(folder / f"{name}.png", content)
-    return [f"{name}.png" for name in pictures]
+        write_bytes(folder / name, content)
+    return list(pictures)
 
 
 def against_reference(run: Run, *, comparable: bool) -> str:
