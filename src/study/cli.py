@@ -1,4 +1,4 @@
-"""The command line: data, run, compare, register, cloud, report."""
+"""The command line: data, run, notebooks, compare, register, cloud, report."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import click
 
 from study import __version__
 from study.errors import StudyError
+from study.notebooks_command import notebooks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,6 +33,9 @@ def cli(context: click.Context, traceback: bool) -> None:
     """Thoracic cartilage ultrasound-CT registration with a dense skeleton graph, as a reproducible study."""
     if isinstance(context.obj, dict):  # `main`, which asks for it after the context has gone
         context.obj["traceback"] = traceback
+
+
+cli.add_command(notebooks)
 
 
 @cli.group()

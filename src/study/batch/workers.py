@@ -81,7 +81,7 @@ class Workers:
             total=len(calls),
             desc=label,
             bar_format="{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed} so far, about {remaining} left",
-            mininterval=0.2 if sys.stderr.isatty() else 15,  # a log file needs a line now and then, not a moving bar
+            mininterval=bar_interval_s(),
             disable=not (self.show_progress and calls),
         )
         for number, outcome in bar:
@@ -101,6 +101,13 @@ class Workers:
                 "expected worker processes to live, got one that ended by itself (is memory short?); finished cases "
                 "are kept: start again to go on, with fewer --jobs"
             ) from error
+
+
+def bar_interval_s() -> float:
+    """How often a bar may move: a log file needs a line now and then, a terminal or a notebook a moving bar."""
+    if sys.stderr.isatty():
+        return 0.2
+    return 1 if "ipykernel" in sys.modules else 15
 
 
 def attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:
