@@ -20,6 +20,7 @@ from study.errors import StudyError
 from study.files.atomic import replacing
 
 KERNEL = "python3"
+KERNELSPEC = {"name": KERNEL, "display_name": "Python 3 (ipykernel)", "language": "python"}  # as JupyterLab writes it
 INJECTED = "injected-parameters"  # papermill's tag of the cell that it adds
 
 
@@ -46,9 +47,7 @@ class Notebook:
     def blank(self) -> Any:
         """A notebook without outputs, whose cells have ids that stay from run to run."""
         notebook = jupytext.reads(self.text, fmt="py:percent")
-        notebook.metadata = nbformat.from_dict(
-            {"kernelspec": {"name": KERNEL, "display_name": "Python 3 (ipykernel)", "language": "python"}}
-        )
+        notebook.metadata = nbformat.from_dict({"kernelspec": KERNELSPEC})
         for number, cell in enumerate(notebook.cells):
             cell["id"] = f"{self.stem}-{number}"  # stable, so that a rerun changes only what it computed
         return notebook
@@ -193,4 +192,27 @@ def without_stderr(notebook: Any) -> Any:
     for cell in notebook.cells:
         if cell.cell_type == "code":
             cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+    return notebook
+
+
+def tidied(notebook: Any) -> Any:
+    """The notebook as the repository keeps it, changed in place: what its script says, and outputs.
+
+    Gone are papermill's cell and metadata, times, what went to standard error and whatever else differs from run to run
+    and says nothing; cells count from 1 as without papermill's.
+    """
+    language = {"language_info": notebook.metadata.get("language_info", {"name": "python"})}
+    notebook.metadata = nbformat.from_dict({"kernelspec": KERNELSPEC, **language})
+    notebook.cells = [cell for cell in notebook.cells if INJECTED not in cell.metadata.get("tags", [])]
+    without_stderr(notebook)
+    n_executed = 0
+    for cell in notebook.cells:
+        tags = cell.metadata.get("tags", [])
+        cell.metadata = nbformat.from_dict({"tags": tags} if tags else {})
+        if cell.cell_type == "code" and cell.execution_count is not None:
+            n_executed += 1
+            cell.execution_count = n_executed
+            for output in cell.outputs:
+                if "execution_count" in output:
+                    output["execution_count"] = n_executed
     return notebook
