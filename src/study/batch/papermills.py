@@ -207,8 +207,8 @@ def tidied(notebook: Any) -> Any:
     without_stderr(notebook)
     n_executed = 0
     for cell in notebook.cells:
-        tags = cell.metadata.get("tags", [])
-        cell.metadata = nbformat.from_dict({"tags": tags} if tags else {})
+        kept = {name: cell.metadata[name] for name in ("tags", "lines_to_next_cell") if cell.metadata.get(name)}
+        cell.metadata = nbformat.from_dict(kept)  # the second is jupytext's: how many empty lines the script has there
         if cell.cell_type == "code" and cell.execution_count is not None:
             n_executed += 1
             cell.execution_count = n_executed
