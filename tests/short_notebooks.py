@@ -1,7 +1,7 @@
 """A process that executes a folder of notebooks in children that it kills; `tests/batch/test_notebooks.py` starts it.
 
-``python short_notebooks.py FOLDER N`` forks a child that executes the notebooks into ``FOLDER/out`` and kills it, N times,
-each time when one more notebook has ended; then it lets one child end. It prints ``killed`` or ``done`` for each.
+``python short_notebooks.py FOLDER N`` forks a child that executes the notebooks into ``FOLDER/out`` and kills it, N
+times, each time when one more notebook has ended; then it lets one child end. It prints ``killed`` or ``done``.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 ``write`` executes them in place, outputs kept; a notebook that fails is named with its cell and error and kept as
 ``.failed.ipynb`` beside the one that stands, the others go on, and the exit code is 1. ``tidy`` drops what Jupyter or
-papermill left in an ``.ipynb`` and the repository does not keep. ``check`` fails when a pair differs in its text, is not
-tidy, has no outputs or has outgrown 1 MB. Pairing itself is jupytext's: ``jupytext --sync notebooks/*.py``.
+papermill left in an ``.ipynb`` and the repository does not keep. ``check`` fails when a pair differs in its text, is
+not tidy, has no outputs or has outgrown 1 MB. Pairing itself is jupytext's: ``jupytext --sync notebooks/*.py``.
 """
 
 from __future__ import annotations

@@ -121,7 +121,12 @@ def test_what_failed_is_named_and_kept_and_what_is_finished_is_left_alone(
     assert 'href="00_sum-seed2.ipynb"' in page
     assert "seed 2" in page
     assert "failed</span>: cell In [3] (&#39;1 / 0&#39;): ZeroDivisionError" in page
-    assert sorted(path.name for path in out.iterdir()) == [".lock", "00_sum-seed2.ipynb", "10_fails.ipynb", "index.html"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        ".lock",
+        "00_sum-seed2.ipynb",
+        "10_fails.ipynb",
+        "index.html",
+    ]
 
     (folder / "10_fails.py").write_text(FAILS.replace("1 / 0", "1 / 1"), encoding="utf-8")
     tasks = plan(find_notebooks(folder), {"seed": [2]})
@@ -182,11 +187,17 @@ def test_a_folder_has_one_writer(folder: Path) -> None:
 
 def test_a_batch_killed_three_times_finishes_and_executes_nothing_twice(tmp_path: Path) -> None:
     for number in range(4):
-        source = f"# %%\nimport time\nfrom pathlib import Path\nwith open('log', 'a') as log:\n    log.write('{number}')\n"
+        source = (
+            f"# %%\nimport time\nfrom pathlib import Path\nwith open('log', 'a') as log:\n    log.write('{number}')\n"
+        )
         wait = f"\n# %%\ntime.sleep({0.0 if number == 3 else 0.2})\n"
         (tmp_path / f"0{number}_waits.py").write_text(source + wait, encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, str(HELPER), str(tmp_path), "3"], capture_output=True, encoding="utf-8", timeout=300, check=True
+        [sys.executable, str(HELPER), str(tmp_path), "3"],
+        capture_output=True,
+        encoding="utf-8",
+        timeout=300,
+        check=True,
     )
     assert done.stdout.split() == ["killed", "killed", "killed", "done"]
     log = (tmp_path / "log").read_text(encoding="utf-8")

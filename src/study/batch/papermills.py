@@ -142,6 +142,8 @@ def execute(
     started: list[Any] = []
 
     def start(cell: Any, cell_index: int) -> None:
+        if cell.cell_type != "code":
+            return
         started.append(cell)
         listener.cell(len(started))
 
