@@ -24,6 +24,8 @@ from study.results.metrics_csv import Row
 from study.results.provenance import arithmetic, provenance
 from study.results.run import Run, run_folder, write_run
 
+JOBS = "STUDY_JOBS"  # environment variable: how many processes a run that a notebook makes may have
+
 
 def run_dataset(
     dataset: Dataset, *, methods: Iterable[str] | None = None, n_jobs: int = 1, show_progress: bool = False
@@ -143,27 +145,49 @@ def why_stale(run: Run, dataset: Dataset, methods: Iterable[str] | None = None) 
     return run.why_stale(dataset.name, run_parameters(dataset, methods), dataset.seed, inputs)
 
 
-def open_run(dataset: str, profile: str = "full", seed: int = 0, *, show_progress: bool = False) -> Run:
+def split_methods(text: str) -> list[str] | None:
+    """Names of methods from one word, ``"icp,cpd"``; None, which stands for all, when it is empty."""
+    return [name.strip() for name in text.split(",")] if text else None
+
+
+def _n_jobs() -> int:
+    """Processes of a run that a notebook makes.
+
+    Raises:
+        StudyError: ``STUDY_JOBS`` is not a number of processes.
+    """
+    told = os.environ.get(JOBS, "")
+    if told and not (told.isdecimal() and int(told) > 0):
+        raise StudyError(f"{JOBS}: expected a number of processes, got {told!r}; unset it or give one from 1")
+    return int(told) if told else min(2, os.cpu_count() or 1)
+
+
+def open_run(
+    dataset: str, profile: str = "full", seed: int = 0, methods: str = "", *, show_progress: bool = False
+) -> Run:
     """The run of a data set: its folder's if the code, parameters and inputs of now made it, else a new one.
 
-    A run that another process is making is waited for.
+    A run that another process is making is waited for. A new one has as many processes as the environment variable
+    ``STUDY_JOBS`` says, which `study notebooks` sets for its notebooks; two, where there are as many cores, without it.
 
     Args:
-        dataset: name of a data set.
+        dataset: name of a data set, or the path of a manifest file.
         profile: ``"full"`` or ``"quick"``.
         seed: of the run.
+        methods: names with commas between, ``"icp,cpd"``, all when empty: a parameter that papermill can give.
         show_progress: bars on standard error.
 
     Raises:
         StudyError: as `run_study`.
     """
     chosen = find_dataset(dataset, find_profile(profile), seed)
-    folder = run_folder(chosen.name, profile, seed)
-    reason = why_stale(Run(folder), chosen)
+    those = split_methods(methods)
+    folder = run_folder(chosen.name, profile, seed, those)
+    reason = why_stale(Run(folder), chosen, those)
     if reason is not None:
         with claimed(folder, wait=True) as claim:
-            reason = why_stale(Run(folder), chosen)  # of now: who was waited for may have made it
+            reason = why_stale(Run(folder), chosen, those)  # of now: who was waited for may have made it
             if reason is not None:
-                _run_claimed(chosen, claim, chosen_methods(None), Workers(min(2, os.cpu_count() or 1), show_progress))
+                _run_claimed(chosen, claim, chosen_methods(those), Workers(_n_jobs(), show_progress))
     made = "loaded: code, parameters and seed are those of now" if reason is None else f"run now: {reason}"
     return _with_values(Run(folder, made))

@@ -1,4 +1,4 @@
-"""The command line: data, run, compare, rerun, register, cloud, report."""
+"""The command line: data, run, notebooks, compare, rerun, register, cloud, report."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import click
 
 from study import __version__
 from study.cli.comparing import compare, rerun
+from study.cli.notebooks import notebooks
 from study.errors import StudyError
 from study.offline import go_offline
 
@@ -37,6 +38,9 @@ def cli(context: click.Context, traceback: bool, offline: bool) -> None:
         context.obj["traceback"] = traceback
     if offline:
         go_offline()
+
+
+cli.add_command(notebooks)
 
 
 @cli.group()
