@@ -53,7 +53,8 @@ notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
 
 reference: $(STAMP)  ## renew results/reference and results/evidence from results/runs (a CHANGELOG entry says why)
 	for d in $$($(BIN)/study datasets --reported); do \
-	  rm -rf results/reference/$$d && cp -r $(RUNS)/$$d results/reference/$$d; done
+	  rm -rf results/reference/$$d && cp -r $(RUNS)/$$d results/reference/$$d && \
+	  rm -f results/reference/$$d/clouds.npz; done
 	for part in robustness sensitivity people; do if [ -d $(EVIDENCE)/$$part ]; then \
 	  mkdir -p results/evidence && rm -rf results/evidence/$$part && cp -r $(EVIDENCE)/$$part results/evidence/$$part; \
 	  fi; done

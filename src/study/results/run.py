@@ -20,6 +20,7 @@ from study.files.atomic import json_text, sha256_of, write_bytes, write_json, wr
 from study.files.places import CHECKOUT
 from study.naming import split_sweep
 from study.results.claim import PROVENANCE, Claim, claimed
+from study.results.clouds import CLOUDS, CaseName, Clouds, write_clouds
 from study.results.compare import Comparison, compare
 from study.results.metrics_csv import (
     CASE,
@@ -248,6 +249,19 @@ class Run:
         """Another run against this one as the reference, see `study.results.compare.compare`."""
         return compare(self.folder, candidate.folder)
 
+    def clouds(self) -> Clouds:
+        """Where every case put its points, see `study.results.clouds`.
+
+        Raises:
+            StudyError: the run kept none, or they are not as it left them.
+        """
+        path = self.folder / CLOUDS
+        if not path.is_file():
+            raise StudyError(f"expected the clouds of a run at {path}, got none; run the data set again")
+        if self.provenance.get("clouds_sha256") != sha256_of(path):
+            raise StudyError(f"{path}: expected the file that the run wrote, got another one; run the data set again")
+        return Clouds(path)
+
     def tables(self) -> list[Path]:
         """The Markdown tables beside the metrics."""
         return sorted(self.folder.glob("hd_table*.md"))
@@ -291,7 +305,12 @@ class Run:
 
 
 def write_run(
-    claim: Claim, rows: Sequence[Row], timings: Sequence[Row], provenance: Mapping[str, Any], failures: str = ""
+    claim: Claim,
+    rows: Sequence[Row],
+    timings: Sequence[Row],
+    provenance: Mapping[str, Any],
+    failures: str = "",
+    clouds: Mapping[CaseName, str] | None = None,
 ) -> Run:
     """Write metrics, timings, tables and provenance of a run that has just ended, all at once.
 
@@ -301,6 +320,8 @@ def write_run(
         timings: of ``timings.csv``.
         provenance: see `study.results.provenance.provenance`; the hashes of the run's files are added.
         failures: tracebacks of cases that failed in a way nobody foresaw.
+        clouds: of each case, as `study.results.clouds.pack` gives them; none are kept where there are none. Their hash
+            stands by itself in the provenance: a run whose clouds were left out of a copy is not an altered one.
 
     Raises:
         StudyError: rows that are not of the schema, or a file of somebody else's in the way; nothing is changed then.
@@ -311,8 +332,11 @@ def write_run(
     if failures:
         write_text(new / FAILURES_LOG, failures)
     write_tables(read_metrics(new / "metrics.csv"), new)
-    hashes = {path.name: sha256_of(path) for path in new.iterdir()}
-    write_json({**provenance, "files_sha256": hashes}, new / PROVENANCE)
+    record = {**provenance, "files_sha256": {path.name: sha256_of(path) for path in new.iterdir()}}
+    if clouds:
+        write_clouds(clouds, new / CLOUDS)
+        record["clouds_sha256"] = sha256_of(new / CLOUDS)
+    write_json(record, new / PROVENANCE)
     claim.swap_in()
     return Run(claim.folder)
 
