@@ -242,8 +242,9 @@ def run_case(case: Case, pair: Pair, radius_mm: float, keeps_clouds: bool = Fals
         rng = named_rng(case.seed, f"{pair.name}/{case.method}")
         result = register_aligned(pair.alignment, find_method(case.method), rng)
     rows = metric_rows(case, judge(pair, result, radius_mm), converged=result.converged)
-    clouds = {"clouds": pack(result, Judgement(pair, result, radius_mm).moved)} if keeps_clouds else {}
-    return {"rows": rows, **clouds}
+    if not keeps_clouds:
+        return {"rows": rows}
+    return {"rows": rows, "clouds": pack(result, Judgement(pair, result, radius_mm).moved, pair.alignment.T_us_ct)}
 
 
 def _timing_rows(work: Work, steps: list[Step]) -> list[Row]:

@@ -17,9 +17,10 @@ import numpy as np
 from study.errors import StudyError
 from study.files.atomic import write_bytes
 from study.registration import Registration
-from study.types import Floats
+from study.types import Floats, RigidTransform
 
 CLOUDS = "clouds.npz"
+N_FIRST = 30  # points by which a pair is known again
 STEP_MM = 0.01  # places are kept in steps of this size, a fraction of what any picture shows
 CaseName = tuple[str, str, str]  # source, target, method
 _INT16 = np.iinfo(np.int16)
@@ -53,15 +54,17 @@ class Steps:
         return self.origin_mm + self.step_mm * self.values.astype(np.float64)
 
 
-def pack(result: Registration, path: Floats) -> str:
+def pack(result: Registration, path: Floats, start: RigidTransform) -> str:
     """What is kept of one registration, as text for a journal.
 
     Args:
         result: of a pair.
         path: (k, 3) mm, the CT's waypoints carried into the US frame.
+        start: the pair's coarse alignment, CT to US.
     """
     graphs = {name: getattr(result, name).nodes for name in ("g_ct", "g_us") if hasattr(result, name)}
-    steps = {name: Steps.of(points) for name, points in {"warped": result.warped, "path": path, **graphs}.items()}
+    clouds = {"warped": result.warped, "path": path, "start": first_places(result.source, start), **graphs}
+    steps = {name: Steps.of(points) for name, points in clouds.items()}
     arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {}
     for name, of in steps.items():
         arrays[name] = of.values
@@ -69,6 +72,11 @@ def pack(result: Registration, path: Floats) -> str:
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
     return b64encode(content.getvalue()).decode("ascii")
+
+
+def first_places(source: Floats, start: RigidTransform) -> Floats:
+    """Where the coarse alignment puts some points of a CT: the same only for the same clouds of CT and US."""
+    return start.apply(source[:: max(1, len(source) // N_FIRST)])
 
 
 def write_clouds(packed: Mapping[CaseName, str], path: Path) -> None:
@@ -85,7 +93,7 @@ def write_clouds(packed: Mapping[CaseName, str], path: Path) -> None:
 class Clouds(Mapping[CaseName, Mapping[str, Floats]]):
     """The cases of a ``clouds.npz``: each case's points (n, 3) mm in the US frame, by what they are.
 
-    ``warped``: a row for each CT point; ``path``: the carried waypoints; ``g_ct`` and ``g_us``: nodes of a method's
+    ``warped``: a row for each CT point; ``path``: the carried waypoints; ``start``: see `first_places`; ``g_ct`` and ``g_us``: nodes of a method's
     graphs, where it has any.
     """
 
