@@ -32,6 +32,7 @@ study: $(STAMP)  ## run the whole study; prints the tables and where the figures
 	  $(BIN)/study run --dataset $$dataset --jobs $(JOBS) || exit 1; done
 	$(BIN)/python tools/notebooks.py run --jobs $(JOBS) --out $(RUNS)/notebooks
 	$(BIN)/study report $(RUNS)
+	$(BIN)/study report --html $(RUNS) --jobs $(JOBS)
 
 evidence: $(STAMP)  ## robustness, sensitivity, more people: up to 90 minutes on 2 cores, goes on where it was stopped
 	$(BIN)/study evidence --out $(EVIDENCE) --jobs $(JOBS)

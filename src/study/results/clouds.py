@@ -93,8 +93,8 @@ def write_clouds(packed: Mapping[CaseName, str], path: Path) -> None:
 class Clouds(Mapping[CaseName, Mapping[str, Floats]]):
     """The cases of a ``clouds.npz``: each case's points (n, 3) mm in the US frame, by what they are.
 
-    ``warped``: a row for each CT point; ``path``: the carried waypoints; ``start``: see `first_places`; ``g_ct`` and ``g_us``: nodes of a method's
-    graphs, where it has any.
+    ``warped``: a row for each CT point; ``path``: the carried waypoints; ``start``: see `first_places`; ``g_ct`` and
+    ``g_us``: nodes of a method's graphs, where it has any.
     """
 
     def __init__(self, path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 
@@ -55,7 +56,19 @@ class NotBorneOut(StudyError):
 def intervals(run: Run, metric: str) -> pd.DataFrame | None:
     """Means of every method with intervals over people; None where the run has no such metric."""
     per_pair = run.per_pair
-    return mean_intervals(per_pair.loc[metric]) if metric in per_pair.index.get_level_values("metric") else None
+    return mean_intervals(_of(run, metric)) if metric in per_pair.index.get_level_values("metric") else None
+
+
+def _of(run: Run, metric: str) -> pd.DataFrame:
+    """Means over each pair's values of one metric: index source, target; a column a method."""
+    per_pair = run.per_pair
+    return per_pair[per_pair.index.get_level_values("metric") == metric].droplevel("metric")
+
+
+def _lead(run: Run, metric: str, of: str, rival: str) -> pd.Series[Any]:
+    """``of`` minus ``rival`` with its interval."""
+    found = difference_intervals(_of(run, metric), of, METRICS[metric].mean_tolerance)
+    return found.T[rival]
 
 
 def metric_table(metric: str, runs: Mapping[str, Run]) -> str:
@@ -85,7 +98,7 @@ def small_table(run: Run) -> str:
     for title, metric in SMALL.items():
         found = intervals(run, metric)
         if found is not None:
-            columns[title] = {label: interval_text(found.loc[m], 1) for m, label in ROWS.items() if m in found.index}
+            columns[title] = {label: interval_text(found.T[m], 1) for m, label in ROWS.items() if m in found.index}
     return str(
         pd.DataFrame(columns).rename_axis(f"`{run.dataset}`, mean [95 %], mm").to_markdown(disable_numparse=True)
     )
@@ -103,18 +116,11 @@ class _Leads:
 
     def lead(self, metric: str, rival: str) -> pd.DataFrame:
         """The graph minus a rival, data sets down."""
-        tolerance = METRICS[metric].mean_tolerance
-        rows = {
-            name: difference_intervals(run.per_pair.loc[metric], GRAPH, tolerance).loc[rival]
-            for name, run in self.runs.items()
-        }
-        return pd.DataFrame(rows).T
+        return pd.DataFrame({name: _lead(run, metric, GRAPH, rival) for name, run in self.runs.items()}).T
 
     def own(self, metric: str, method: str) -> pd.DataFrame:
         """A method's means, data sets down."""
-        return pd.DataFrame(
-            {name: mean_intervals(run.per_pair.loc[metric]).loc[method] for name, run in self.runs.items()}
-        ).T
+        return pd.DataFrame({name: mean_intervals(_of(run, metric)).T[method] for name, run in self.runs.items()}).T
 
     @property
     def names(self) -> str:
@@ -175,7 +181,8 @@ def _by_the_paper(every: _Leads) -> str:
     return (
         "1. **As published, and by the paper's own measures, the skeleton graph comes first of the paper's four "
         "methods, as in the paper**: its Hausdorff distance is smaller than that of CPD as shipped by "
-        f"{_listed(ahead[HD, 'cpd'], -1)} mm on {every.names}{'; a tie with ' + ' and '.join(equal) if equal else ''}.\n"
+        f"{_listed(ahead[HD, 'cpd'], -1)} mm on {every.names}"
+        f"{'; a tie with ' + ' and '.join(equal) if equal else ''}.\n"
     )
 
 
@@ -198,7 +205,7 @@ def _by_the_truth(every: _Leads, known: _Leads) -> str:
     for rival in ("cpd_tuned", BEST_METHOD):
         behind = known.lead(TRUE, rival)
         _need(bool((behind["low"] > 0).all()), f"the truth reverses the order of the graph and {rival}")
-    scores = [run.per_pair.loc[PROTOCOL].mean() for run in known.runs.values()]
+    scores = [_of(run, PROTOCOL).mean() for run in known.runs.values()]
     _need(all(score[TRUTH] > score[GRAPH] for score in scores), "the protocol prefers the graph to the truth")
     own, best, perfect = known.own(TRUE, GRAPH), known.own(TRUE, BEST_METHOD), known.own(PROTOCOL, TRUTH)
     return (
@@ -212,10 +219,7 @@ def _by_the_truth(every: _Leads, known: _Leads) -> str:
 
 def between_real_people(run: Run) -> str:
     """What the protocol says of the graph and tuned CPD where no truth is known, and what is left of it in plane."""
-    whole, plane = (
-        difference_intervals(run.per_pair.loc[metric], "cpd_tuned", METRICS[metric].mean_tolerance).loc[GRAPH]
-        for metric in (PROTOCOL, "waypoint_error_inplane")
-    )
+    whole, plane = (_lead(run, metric, "cpd_tuned", GRAPH) for metric in (PROTOCOL, "waypoint_error_inplane"))
     return (
         f"Between real people (`{run.dataset}`), where the truth is not known, the graph leads CPD tuned on the "
         f"visible surface by {interval_text(whole)} mm of the protocol's waypoint error; in the feature plane, which a "
