@@ -7,7 +7,7 @@
   // viridis: rising lightness, told apart by colour-blind readers, and unlike the grey of the CT.
   const RAMP = ["440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725"];
   const TOP_MM = 12;  // one scale for every pair and method, so that two views can be compared
-  const COLOURS = { us: "56b4e9", source: "b9bec6", carried: "d55e00", goal: "000000", gct: "cc79a7", gus: "0072b2" };
+  const COLOURS = { us: "56b4e9", source: "8d949e", carried: "d55e00", goal: "ffffff", gct: "cc79a7", gus: "0072b2" };
   const PARTS = ["8c8c8c", "0072b2", "e69f00", "009e73", "cc79a7", "61a8d1", "f0c361", "61c4ab", "e0aecb"];
   const rgb = (hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16));
   const ramp = RAMP.map(rgb);
@@ -169,14 +169,14 @@
   }
   function offerOnly() { fill(by("v-dataset"), config.datasets.map((set, k) => [String(k), set.name]), "0"); offer(); }
   nv = new niivue.Niivue({
-    backColor: [1, 1, 1, 1], crosshairWidth: 0, show3Dcrosshair: false, isOrientCube: true, dragAndDropEnabled: false,
+    backColor: [0.8, 0.82, 0.84, 1], crosshairWidth: 0, show3Dcrosshair: false, isOrientCube: true, dragAndDropEnabled: false,
     loadingText: "", logLevel: "silent", isColorbar: false, meshXRay: 0,
   });
   await nv.attachToCanvas(canvas);
   nv.setRadiologicalConvention(true);
   nv.setSliceType(nv.sliceTypeRender);
   nv.setRenderAzimuthElevation(180, 10);
-  nv.setScale(1.25);
+  nv.setScale(1.15);
 
   let shown = { ct: null, meshes: {} }, turn = 0;
 
