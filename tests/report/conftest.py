@@ -20,18 +20,18 @@ PIXEL = (  # a PNG
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
 )
 
+WIDGET = '<script src="https://cdn.example/widget.js"></script><table><tr><td>1</table>'
+
 
 def small_notebook(path: Path) -> None:
     """A notebook with what an executed one holds: TeX, a picture, a wide table, a widget's script, markup in text."""
     picture = nbformat.v4.new_output(  # type: ignore[no-untyped-call]
         "display_data",
-        data={
-            "image/png": "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
-        },
+        data={"image/png": PIXEL},
     )
     script = nbformat.v4.new_output(  # type: ignore[no-untyped-call]
         "display_data",
-        data={"text/html": '<script src="https://cdn.example/widget.js"></script><table><tr><td>1</table>'},
+        data={"text/html": WIDGET},
     )
     said = nbformat.v4.new_output("stream", name="stdout", text="<b>not bold</b> $x$")  # type: ignore[no-untyped-call]
     cells = [

@@ -22,7 +22,7 @@ from study.report.drawings import shown_titles, write_drawings
 from study.report.notebooks import notebook_page
 from study.results.finding import MEASURES, NotBorneOut, between_real_people, metric_table, reading, small_table
 from study.results.run import Run, visible
-from study.results.verdicts import claims_markdown
+from study.results.verdicts import claim_rows, claims_markdown
 
 FOLDER = "report"
 STATIC = ("viewer.js", "viewer_data.js", "style.css", "niivue.umd.js", "niivue.LICENSE.txt")
@@ -135,6 +135,7 @@ def _context(
         "mark": MARK,
         "finding": _finding(runs),
         "small": _html(small_table((known or list(runs.values()))[0])),
+        "verdicts": _html(_verdicts(list(runs.values()))),
         "claims": _html(claims_markdown(list(runs.values())).partition("\n")[2]),
         "tables": [(METRICS[metric], _html(table)) for metric, table in measures.items()],
         "table_one": [(name, _html(_plain(run.hd_table()))) for name, run in runs.items()],
@@ -153,6 +154,14 @@ def _has(runs: Mapping[str, Run], metric: str) -> bool:
 
 def _plain(table: pd.DataFrame) -> str:
     return str(table.round(2).to_markdown(disable_numparse=True))
+
+
+def _verdicts(runs: list[Run]) -> str:
+    """How many claims there are of each verdict on each data set, as Markdown."""
+    rows = claim_rows(runs)
+    counts = rows[rows["dataset"].isin([run.dataset for run in runs])].value_counts(["verdict", "dataset"])
+    table = counts.unstack("dataset").reindex(columns=[run.dataset for run in runs]).fillna(0).astype(int)
+    return str(table.rename_axis("claims that are", axis="index").to_markdown())
 
 
 def _finding(runs: Mapping[str, Run]) -> str:
