@@ -61,6 +61,7 @@ def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) ->
     assert set(metrics["status"]) <= {"ok", "not converged"}
     assert (tmp_path / "metrics.csv").read_bytes() == (first / "metrics.csv").read_bytes()
     assert (tmp_path / "hd_table.md").read_bytes() == (first / "hd_table.md").read_bytes()
+    assert (tmp_path / "clouds.npz").read_bytes() == (first / "clouds.npz").read_bytes()
 
 
 def test_one_method_alone_has_the_rows_it_has_among_others(first: Path) -> None:

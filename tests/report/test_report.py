@@ -119,7 +119,7 @@ def test_files_of_the_view_hold_the_runs_places(report: Path) -> None:
     whole = clouds["warped"]
     rest = points_of(ct, "source") + moved["skeleton_graph"]
     ordered = np.sort(np.linalg.norm(rest - rest.mean(axis=0), axis=1))
-    assert len(rest) == min(2400, len(whole))
+    assert len(rest) == min(VERTICES, len(whole))
     assert ordered[-1] <= np.linalg.norm(whole - whole.mean(axis=0), axis=1).max() + 2  # a rigid motion keeps it
     assert "1.g_us" in pair["table"]
     assert "0.g_us" not in pair["table"]

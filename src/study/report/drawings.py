@@ -8,7 +8,6 @@ from typing import Any
 
 from study.batch.workers import Workers
 from study.datasets import Dataset, find_dataset
-from study.evaluation.metrics import METRICS
 from study.figures import method_style
 from study.files.atomic import write_text
 from study.naming import split_sweep
@@ -17,7 +16,11 @@ from study.report.scenes import Drawn, drawn_ct, drawn_pair
 from study.results.clouds import CLOUDS, Clouds
 from study.results.run import PAIR, Run
 
-SHOWN = ("hd", "waypoint_error", "true_waypoint_error")  # numbers beside the view
+SHOWN = {  # metrics beside the view, and what they are called there
+    "hd": "Hausdorff distance",
+    "waypoint_error": "waypoint error by the paper's protocol",
+    "true_waypoint_error": "true waypoint error",
+}
 KINDS = {
     "real": "The CT is of a real person; the ultrasound is simulated: a virtual sweep over {whom}, never measured.",
     "synthetic": "Both people are synthetic, and the ultrasound is simulated: nothing here was measured on anybody.",
@@ -92,11 +95,6 @@ def _offered_pair(
         "pair": {"key": _key(dataset, *pair), "file": _file(dataset, *pair)},
         "values": values,
     }
-
-
-def shown_titles() -> dict[str, str]:
-    """What the numbers beside the view are called."""
-    return {metric: METRICS[metric].title for metric in SHOWN}
 
 
 def _key(dataset: Dataset, *names: str) -> str:

@@ -18,7 +18,7 @@ from study.datasets import reported
 from study.errors import StudyError
 from study.evaluation.metrics import METRICS
 from study.report.assets import ASSETS, require_vendored
-from study.report.drawings import shown_titles, write_drawings
+from study.report.drawings import SHOWN, write_drawings
 from study.report.notebooks import notebook_page
 from study.results.finding import MEASURES, NotBorneOut, between_real_people, metric_table, reading, small_table
 from study.results.run import Run, visible
@@ -142,7 +142,7 @@ def _context(
         "pictures": pictures,
         "offers": offers,
         # In a script element nothing is escaped but the end of the element.
-        "config": json.dumps({"datasets": offers, "titles": shown_titles()}).replace("<", "\\u003c"),
+        "config": json.dumps({"datasets": offers, "titles": SHOWN}).replace("<", "\\u003c"),
         "provenance": _provenance(runs),
         "notebooks": notebooks,
     }

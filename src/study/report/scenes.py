@@ -30,10 +30,10 @@ from study.results.clouds import Clouds, first_places
 from study.skeleton.template import template_graph
 from study.types import Floats, Ints, Mesh, RigidTransform, Volume
 
-VERTICES = 2400  # of the surface drawn, each a point of the CT's cloud: about 5 mm apart
-VOXEL_MM = np.array([1.6, 1.6, 2.5])
+VERTICES = 3600  # of the surface drawn, each a point of the CT's cloud: about 4 mm apart
+VOXEL_MM = np.array([1.4, 1.4, 2.5])
 MARGIN_MM = 12.0
-WINDOW_HU = (-160.0, 440.0)  # black to white: fat to dense bone
+WINDOW_HU = (-200.0, 650.0)  # black to white: fat to dense bone and vessels with contrast agent
 STEP_MM = 0.02  # of places in the files
 SAME_MM = 0.1  # a pair made again lies where it was, but for rounding and another maker's arithmetic
 _INT16 = np.iinfo(np.int16)
