@@ -172,7 +172,14 @@ def run_evidence(
     for name in datasets_for_evidence() if plan.datasets is None else plan.datasets:
         dataset, folder = find_dataset(name, params), out / name
         if why_stale(Run(folder), dataset, plan.compared) is not None:
-            run_study(dataset, folder, methods=plan.compared, n_jobs=n_jobs, show_progress=show_progress)
+            run_study(
+                dataset,
+                folder,
+                methods=plan.compared,
+                n_jobs=n_jobs,
+                show_progress=show_progress,
+                keep_clouds=False,  # of more people than anybody looks at
+            )
         runs.append(Run(folder))
     return [*folders, *(run.folder for run in runs), *([_people(runs, out / PEOPLE)] if runs else [])]
 

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from study.batch.cases import Work, all_rows, input_hashes
+from study.batch.cases import Work, all_cases, input_hashes
 from study.batch.workers import Workers
 from study.datasets import Dataset, find_dataset
 from study.errors import StudyError
@@ -44,7 +44,9 @@ def run_dataset(
     Raises:
         StudyError: nobody to pair, or an unknown method; a person or pair that fails is rows instead.
     """
-    return all_rows(Work(dataset, Workers(n_jobs, show_progress), Journal(None, {})), chosen_methods(methods))
+    work = Work(dataset, Workers(n_jobs, show_progress), Journal(None, {}), keeps_clouds=False)
+    results = all_cases(work, chosen_methods(methods))
+    return results.rows, results.timings
 
 
 def chosen_methods(methods: Iterable[str] | None) -> list[str]:
@@ -69,6 +71,7 @@ def run_study(
     n_jobs: int = 1,
     show_progress: bool = False,
     scheduler: str | None = None,
+    keep_clouds: bool = True,
 ) -> Run:
     """Run a data set and put ``metrics.csv``, ``timings.csv``, ``provenance.json`` and tables into ``out``, at once.
 
@@ -81,6 +84,7 @@ def run_study(
         n_jobs: worker processes.
         show_progress: bars on standard error.
         scheduler: of a Dask cluster whose workers do it instead, as in ``tcp://127.0.0.1:8786``.
+        keep_clouds: what `study report --html` draws, about 50 kB a case.
 
     Raises:
         StudyError: as `run_dataset`; a folder that is not a run's or that another process is writing; or no case that
@@ -89,11 +93,13 @@ def run_study(
     chosen = chosen_methods(methods)
     dataset.pairs()  # nobody to pair leaves no folder
     with claimed(out) as claim:  # a folder that can't be written is better known now than after the run
-        _run_claimed(dataset, claim, chosen, Workers(n_jobs, show_progress, scheduler))
+        _run_claimed(dataset, claim, chosen, Workers(n_jobs, show_progress, scheduler), keep_clouds)
     return _with_values(Run(out))
 
 
-def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Workers) -> None:
+def _run_claimed(
+    dataset: Dataset, claim: Claim, methods: list[str], workers: Workers, keep_clouds: bool = True
+) -> None:
     started = datetime.now(UTC)
     basis = {
         **arithmetic(),
@@ -102,8 +108,8 @@ def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Wo
         "study": asdict(dataset.params),
         "seed": dataset.seed,
     }
-    work = Work(dataset, workers, Journal(claim.journal, basis))
-    rows, timings = all_rows(work, methods)
+    work = Work(dataset, workers, Journal(claim.journal, basis), keeps_clouds=keep_clouds)
+    results = all_cases(work, methods)
     inputs = {dataset.manifest.path.name: basis["manifest"]}
     inputs |= {key: sha256 for files in work.inputs.values() for key, sha256 in files.items()}
     parameters = run_parameters(dataset, methods)
@@ -111,7 +117,7 @@ def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Wo
     record["peak_memory_mb"] = round(work.peak_mb)  # of one process; the timing rows have asked for every step
     record["code_sha256"] = basis["code_sha256"]  # that was run, whatever was edited since
     failures = [f"{' '.join(filter(None, step))}\n{trace}" for step, trace in work.traces.items()]
-    write_run(claim, rows, timings, record, "\n".join(failures), _made_with(dataset))
+    write_run(claim, results.rows, results.timings, record, "\n".join(failures), _made_with(dataset), results.clouds)
 
 
 def _made_with(dataset: Dataset) -> dict[str, Path]:
