@@ -30,7 +30,7 @@ def notebook_page(path: Path, template: jinja2.Template) -> tuple[str, str]:
         StudyError: a file that is no notebook.
     """
     try:
-        notebook = nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
+        notebook = nbformat.read(path, as_version=4)
     except (OSError, ValueError, AttributeError, nbformat.ValidationError) as error:
         told = " ".join(str(error).split())[:200]
         raise StudyError(f"expected a notebook at {path}, got: {told}; execute it again") from error
