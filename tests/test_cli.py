@@ -90,7 +90,7 @@ def refused(capsys: Capture, *arguments: str | Path) -> str:
 @pytest.mark.parametrize(
     "words",
     [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"], ["datasets"], ["evidence"],
-     ["data", "list"], ["data", "fetch"], ["data", "verify"]],
+     ["landmarks"], ["data", "init"], ["data", "list"], ["data", "fetch"], ["data", "verify"]],
     ids=" ".join,
 )  # fmt: skip
 def test_every_command_explains_itself(words: list[str], capsys: Capture) -> None:
