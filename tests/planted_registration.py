@@ -9,7 +9,7 @@ import numpy as np
 from study.registration import FieldRegistration, Registration
 from study.types import Floats, RigidTransform
 
-SOURCE = np.random.default_rng(5).uniform([-90, -10, -80], [90, 10, 80], size=(3000, 3)) + [20.0, 150.0, 1200.0]
+SOURCE = np.random.default_rng(5).uniform([-70, 140, 1120], [110, 160, 1280], size=(3000, 3))
 T_US_CT = RigidTransform.random(np.random.default_rng(1))
 
 

@@ -30,7 +30,7 @@ def test_places_go_back_to_where_they_came_from(field: bool, limit_mm: float) ->
 
 @pytest.mark.parametrize("field", [True, False])
 def test_far_from_every_point_the_rigid_part_answers(field: bool) -> None:
-    far = T_US_CT.apply(SOURCE[:4] + [0.0, 400.0, 0.0])
+    far = T_US_CT.apply(np.add(SOURCE[:4], [0.0, 400.0, 0.0]))
     back, known = pull_back(planted(field=field), far)
     assert np.allclose(back, T_US_CT.inverse.apply(far))
     assert known.all()

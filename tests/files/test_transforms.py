@@ -41,7 +41,8 @@ def test_resampling_by_the_field_lands_the_ct_where_warped_is(tmp_path: Path, fi
     made = sample_field(result, grid)
     write_field(made, tmp_path / "d.nii.gz")
     chosen = [
-        int(np.argmin(np.linalg.norm(SOURCE - place, axis=1))) for place in SOURCE.mean(0) + [[-60, 0, 0], [50, 0, 40]]
+        int(np.argmin(np.linalg.norm(SOURCE - place, axis=1)))
+        for place in np.add(SOURCE.mean(0), [[-60, 0, 0], [50, 0, 40]])
     ]
     origin = FLIP @ np.array([SOURCE[:, 0].max() + 20, SOURCE[:, 1].max() + 20, SOURCE[:, 2].min() - 20])
     sizes = np.ceil((np.ptp(SOURCE, axis=0) + 40) / 2).astype(int)

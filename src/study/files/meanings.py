@@ -56,8 +56,7 @@ ROBOT_MEANINGS = {
     "carried": "false: the waypoint has no place in the US frame, and reason says why; a path has a gap there",
     "position": "x, y, z in the frame named above, mm, as deep as picked in the CT: not on the skin",
     "normal": "unit vector from the chest to the skin in the same frame; a probe on the skin looks the opposite way",
-    "normal_from": "surface: of the plane through the US points within 30 mm; chest: too few of them, the whole chest's "
-    "front instead",
+    "normal_from": "surface: of the plane through the US points within 30 mm; chest: too few, so the front",
     "bound_mm": "19 times in 20 the position is at most this far from its true place, on people like those of the "
     "calibration; null of a method without bounds, and of a suspect result",
     "quality.ct_distance_mm": "from the waypoint to the nearest CT point, in the CT frame",

@@ -52,7 +52,7 @@ def register_files(
     path = None if waypoints is None else read_waypoint_file(waypoints)
     spacing_mm = None if field is None else _number(field)
     grid = None if field is None or spacing_mm is not None else read_grid(field)
-    check_outputs(out, [one for one in (ct, us, waypoints, Path(field or "")) if one is not None])
+    check_outputs(out, [Path(one) for one in (ct, us, waypoints, field) if one is not None])
     person, seen = read_ply_file(ct), read_ply_file(us)
     inputs = {"ct": _described(ct, person), "us": _described(us, seen) | {"timed": seen.times is not None}}
     if waypoints is not None and path is not None:
