@@ -192,6 +192,7 @@ def test_a_field_that_does_not_hold_the_result_or_lead_back_is_warned_of(tmp_pat
     assert any(
         re.search("field: it takes 1 in 20 warped points over .* mm from where they came from", one) for one in warnings
     )
+    grid = grid_around(result.warped, 10.0)
     half = replace(grid, shape=(grid.shape[0] // 2, *grid.shape[1:]), name="half.nii.gz")
     _, warnings = written(tmp_path / "half", result, grid=half)
     assert any(re.search("of the warped points lie outside half", one) for one in warnings)

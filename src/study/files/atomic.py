@@ -56,7 +56,7 @@ def filling(folder: Path, names: Collection[str], last: str) -> Iterator[Path]:
         folder.mkdir(exist_ok=True)
         for name in (last, *(name for name in names if name != last)):
             (folder / name).unlink(missing_ok=True)
-        for path in sorted(temporary.iterdir(), key=lambda path: path.name == last):
+        for path in sorted(temporary.iterdir(), key=lambda path: (path.name == last, path.name)):
             path.replace(folder / path.name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
