@@ -255,7 +255,7 @@ def compare(reference: Path, candidate: Path) -> None:
     show_default=True,
     help="A name in METHODS; the default is the paper's, gaussian_process has the smallest true error.",
 )
-@click.option("--waypoints", type=click.Path(path_type=Path), help="CSV with columns x, y, z: mm in the CT frame.")
+@click.option("--waypoints", type=click.Path(path_type=Path), help="Of the CT frame, mm: .csv, .mrk.json or .fcsv.")
 @click.option(
     "--radius",
     default=20.0,
@@ -264,30 +264,36 @@ def compare(reference: Path, candidate: Path) -> None:
     metavar="MM",
     help="Sphere around a waypoint whose points carry it.",
 )
-@click.option("--front", metavar="X,Y,Z", help="Direction from the chest to the probe, in the frame of US.")
+@click.option("--front", metavar="X,Y,Z", help="Direction from the chest to the probe, in the frame of US, RAS.")
+@click.option("--field", metavar="GRID|MM", help="Displacement field too, on an image's grid (US frame) or of MM.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of results.")
 def register(
-    ct: Path, us: Path, method: str, waypoints: Path | None, radius: float, front: str | None, seed: int, out: Path
+    ct: Path,
+    us: Path,
+    method: str,
+    waypoints: Path | None,
+    radius: float,
+    front: str | None,
+    field: str | None,
+    seed: int,
+    out: Path,
 ) -> None:
     """Register two clouds of one's own (PLY, mm, any rigid pose): sternum and cartilages 2-5, nothing else.
 
     A property "time" of US's vertices says when each was seen, in seconds; methods that know of breathing use it.
+    A comment SPACE=LPS in a PLY file is heeded. docs/formats.md says what is read and written; files of an earlier
+    registration in OUT are replaced, other files stay.
     """
-    from study.files.clouds import NOT_CARRIED, read_ply, read_timed_ply, read_waypoints, write_registration
-    from study.pipeline import find_method, register_pair
+    from study.files.register_files import register_files
 
-    find_method(method)
-    path = None if waypoints is None else read_waypoints(waypoints)
     towards = None if front is None else _numbers(front, "--front", "X,Y,Z", 3)
-    person, (seen, times) = read_ply(ct), read_timed_ply(us)
-    result = register_pair(person, seen, method=method, seed=seed, front=towards, times=times)
-    for line in write_registration(result, out, path, radius):
-        if line.startswith(NOT_CARRIED):
-            click.echo(f"study: warning: {line}", err=True)
-        else:
-            click.echo(line)
-    for warning in [*result.warnings, *([] if result.converged else [f"not converged: {result.stop_reason}"])]:
+    lines, warnings = register_files(
+        ct, us, out, method=method, waypoints=waypoints, radius_mm=radius, front=towards, seed=seed, field=field
+    )
+    for line in lines:
+        click.echo(line)
+    for warning in warnings:
         click.echo(f"study: warning: {warning}", err=True)
 
 

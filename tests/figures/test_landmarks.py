@@ -52,7 +52,7 @@ def test_each_landmark_has_a_panel_in_which_3_mm_can_be_judged() -> None:
 
 
 def test_an_outline_lies_on_the_part_that_grew() -> None:
-    ct, wall, parts = chest()
+    _, wall, parts = chest()
     alone = parts.with_values(np.where(parts.values == Part.LEFT_3, parts.values, int(Part.UNKNOWN)).astype(np.int8))
     (ax,) = figures.chest_front(wall, None, alone).axes
     (outline,) = [path for drawn in ax.collections for path in drawn.get_paths() if len(path.vertices)]

@@ -21,11 +21,11 @@ from study.files.atomic import replacing
 from study.files.dicom import read_dicom
 from study.files.headers import ORTHOGONAL_ATOL, itk_geometry
 from study.files.nifti import read_nifti_header
+from study.files.spaces import LPS_TO_RAS
 from study.files.stored import read_pixels
 from study.files.text_images import read_metaimage_header, read_nrrd_header
 from study.types import Floats, RigidTransform, Volume
 
-LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0])
 HEADERS = {
     ".nii": read_nifti_header,
     ".nii.gz": read_nifti_header,
