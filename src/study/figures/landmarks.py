@@ -138,7 +138,7 @@ def _image(ax: Axes, values: Floats, x: Floats, y: Floats) -> None:
         extent=(x[0], x[-1], y[0], y[-1]),
         vmin=_WINDOW_HU[0],
         vmax=_WINDOW_HU[1],
-        interpolation="bilinear",
+        interpolation="nearest",
     )
 
 
