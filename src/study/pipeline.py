@@ -92,7 +92,9 @@ def register_pair(
     result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
     if len(alignment.source.cloud) == len(given):
         return result
-    return replace(result, source=given.points, warped=result.carry(given.points, CARRIERS))
+    _, like = nearest(given.points, result.source)
+    parts = None if result.parts is None else result.parts[like]
+    return replace(result, source=given.points, warped=result.carry(given.points, CARRIERS), parts=parts)
 
 
 def _as_cloud(
@@ -178,6 +180,8 @@ def register_aligned(
         quality=quality,
         warnings=(*suspect, *result.warnings, *quality_warnings(quality)),
         converged=result.converged and quality.wrong_part_share <= QUALITY_LIMITS[SWAPPED][0],
+        parts=source.parts,
+        front=alignment.target.T_cloud_chest.rotation[:, 2],
     )
 
 

@@ -118,6 +118,7 @@ def test_figures_import_no_method_and_no_pyplot() -> None:
                 modules.update(alias.name for alias in node.names)
     ours = {name for name in modules if name and name.startswith("study") and not name.startswith("study.figures")}
     nouns = {"study.errors", "study.geometry.points", "study.naming", "study.skeleton.graph", "study.types"}
+    nouns |= {"study.ct.landmarks", "study.ct.wall"}
     judged = {f"study.evaluation.{name}" for name in ("metrics", "pair", "statistics")}
     assert ours == nouns | judged
     assert "matplotlib.pyplot" not in modules

@@ -11,6 +11,7 @@ from typing import Any
 
 from study.batch.cases import Work, all_cases, input_hashes
 from study.batch.workers import Workers
+from study.data.manifest import default_manifest_path
 from study.datasets import Dataset, find_dataset
 from study.errors import StudyError
 from study.files.atomic import sha256_of
@@ -116,6 +117,9 @@ def _run_claimed(
     record = provenance(dataset.name, parameters, dataset.seed, inputs, started, datetime.now(UTC))
     record["peak_memory_mb"] = round(work.peak_mb)  # of one process; the timing rows have asked for every step
     record["code_sha256"] = basis["code_sha256"]  # that was run, whatever was edited since
+    record["own_manifest"] = (
+        dataset.manifest.path != default_manifest_path()
+    )  # whose people are no others' of the paper
     failures = [f"{' '.join(filter(None, step))}\n{trace}" for step, trace in work.traces.items()]
     write_run(claim, results.rows, results.timings, record, "\n".join(failures), _made_with(dataset), results.clouds)
 

@@ -99,6 +99,11 @@ class Run:
             raise StudyError(f"expected {path}, got: {' '.join(str(error).split())}; run the data set again") from error
 
     @property
+    def own_manifest(self) -> bool:
+        """Whether its people are of a manifest of one's own: the paper's numbers are not put beside them."""
+        return bool(self.provenance.get("own_manifest", False))
+
+    @property
     def dataset(self) -> str:
         """Name of the data set.
 
@@ -154,7 +159,7 @@ class Run:
 
     def waypoint_summary(self) -> pd.DataFrame:
         """Waypoint errors of each method, see `study.results.tables.waypoint_summary`."""
-        return waypoint_summary(self.metrics)
+        return waypoint_summary(self.metrics, with_paper=not self.own_manifest)
 
     def summary(self) -> pd.DataFrame:
         """Every metric of every method as text, mean ± population SD over the pairs (n)."""
@@ -336,7 +341,7 @@ def write_run(
     write_timings(timings, new / "timings.csv")
     if failures:
         write_text(new / FAILURES_LOG, failures)
-    write_tables(read_metrics(new / "metrics.csv"), new)
+    write_tables(read_metrics(new / "metrics.csv"), new, with_paper=not provenance.get("own_manifest", False))
     write_json(provenance["parameters"], new / "parameters.json")
     for name, path in (copies or {}).items():
         write_bytes(new / name, path.read_bytes())
