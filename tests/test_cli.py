@@ -90,7 +90,7 @@ def refused(capsys: Capture, *arguments: str | Path) -> str:
 @pytest.mark.parametrize(
     "words",
     [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"], ["datasets"], ["evidence"],
-     ["data", "list"], ["data", "fetch"], ["data", "verify"]],
+     ["landmarks"], ["data", "init"], ["data", "list"], ["data", "fetch"], ["data", "verify"]],
     ids=" ".join,
 )  # fmt: skip
 def test_every_command_explains_itself(words: list[str], capsys: Capture) -> None:
@@ -271,7 +271,7 @@ def test_front_radius_quality_and_warnings(clouds: Path, tmp_path: Path, capsys:
     assert all(f"study: warning: {one}" in said for one in summary["warnings"])
     line = refused(capsys, *words[:-1], "back", "--front", "0,-1,0")
     assert "us: expected cartilages that arch towards the `front` given" in line
-    assert "expected three numbers" in refused(capsys, *words[:-1], "back", "--front", "up")
+    assert "expected 3 numbers" in refused(capsys, *words[:-1], "back", "--front", "up")
     assert "--radius" in refused(capsys, *words[:-1], "back", "--radius", "-3")
     assert not (tmp_path / "back").exists()
 

@@ -1,4 +1,4 @@
-"""The command line: data, run, compare, register, cloud, report."""
+"""The command line: data, run, notebooks, compare, rerun, register, cloud, report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING
 import click
 
 from study import __version__
+from study.cli.comparing import compare, rerun
+from study.cli.notebooks import notebooks
 from study.errors import StudyError
+from study.offline import go_offline
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,11 +30,17 @@ DATASETS = "A name in data_manifest.yaml (`study datasets` lists them), or a man
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="study")
 @click.option("--traceback", is_flag=True, envvar="STUDY_TRACEBACK", help="Show where an unforeseen error arose.")
+@click.option("--offline", is_flag=True, help="Refuse every connection beyond this machine, as STUDY_OFFLINE=1 does.")
 @click.pass_context
-def cli(context: click.Context, traceback: bool) -> None:
+def cli(context: click.Context, traceback: bool, offline: bool) -> None:
     """Thoracic cartilage ultrasound-CT registration with a dense skeleton graph, as a reproducible study."""
     if isinstance(context.obj, dict):  # `main`, which asks for it after the context has gone
         context.obj["traceback"] = traceback
+    if offline:
+        go_offline()
+
+
+cli.add_command(notebooks)
 
 
 @cli.group()
@@ -93,6 +102,28 @@ def data_verify(dataset: str | None) -> None:
     click.get_current_context().exit(0 if (table["status"] == "verified").all() else 1)
 
 
+@data.command("init", short_help="Write a commented manifest for a folder of CTs.")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="Manifest to write.  [default: FOLDER/manifest.yaml]"
+)
+def data_init(folder: Path, out: Path | None) -> None:
+    """Write a commented manifest for a folder of CTs, with the labels or landmarks beside them."""
+    from study.data.draft import draft_manifest
+    from study.data.manifest import load_manifest
+    from study.files.atomic import write_text
+
+    out = out or folder / "manifest.yaml"
+    if out.exists():
+        raise StudyError(f"expected a new file, got {out}, which is there; delete it or give another name by --out")
+    text, absent = draft_manifest(folder, out)
+    write_text(out, text)
+    cohort = next(iter(load_manifest(out).cohorts.values()))
+    click.echo(f"{len(cohort.subjects)} CTs: {out}; look it over, then `study run --dataset {out}`")
+    if absent:
+        click.echo(f"study: warning: without labels or landmarks: {', '.join(absent)}; see `study landmarks`", err=True)
+
+
 @cli.command("datasets", short_help="Print the names of the data sets.")
 @click.option("--reported", is_flag=True, help="Only those that the study reports.")
 @click.option("--evidence", is_flag=True, help="Only those that `make evidence` runs.")
@@ -112,12 +143,17 @@ def list_datasets(reported: bool, evidence: bool) -> None:
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1), help="Worker processes.")
 @click.option(
+    "--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask cluster; see docs/scaling.md."
+)
+@click.option(
     "--out",
     type=click.Path(path_type=Path),
     help="Folder of results.  [default: results/runs/<dataset> here for the full profile, all methods and seed 0, "
     "else a folder of its own below results/trials]",
 )
-def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, out: Path | None) -> None:
+def run(
+    dataset: str, profile: str, methods: str | None, seed: int, jobs: int, scheduler: str | None, out: Path | None
+) -> None:
     """Run every pair of a dataset with every method.
 
     A run that was stopped goes on when the same command is given again: finished cases are kept beside its folder.
@@ -127,11 +163,13 @@ def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, o
     from study.params import find_profile
     from study.results.run import run_folder
 
+    if scheduler is not None and jobs != 1:
+        raise StudyError("expected either --jobs or --scheduler, got both; the cluster says how many workers there are")
     chosen = None if methods is None else [name.strip() for name in methods.split(",")]
     people = find_dataset(dataset, find_profile(profile), seed)
     if out is None:
         out = run_folder(people.name, profile, seed, chosen, Path())
-    _report(run_study(people, out, methods=chosen, n_jobs=jobs, show_progress=True))
+    _report(run_study(people, out, methods=chosen, n_jobs=jobs, show_progress=True, scheduler=scheduler))
 
 
 @cli.command(short_help="Gather what `make evidence` shows: robustness, sensitivity, more people.")
@@ -156,7 +194,8 @@ def _report(run: Run) -> None:
     for table in run.tables():
         click.echo(f"\n{table.read_text(encoding='utf-8')}")
     if not run.values.empty:
-        click.echo("Waypoint errors, mm (sec. IV-B; paper: its own volunteer, other data)\n")
+        beside = "" if run.own_manifest else "; paper: its own volunteer, other data"
+        click.echo(f"Waypoint errors, mm (sec. IV-B{beside})\n")
         click.echo(run.waypoint_summary().round(2).to_string(index=False, na_rep="-"))
     for (source, target, reason), cases in run.failures.groupby(["source", "target", "reason"], sort=False):
         click.echo(f"{source} to {target}, {', '.join(cases['method'])}: failed: {reason}")
@@ -167,12 +206,23 @@ def _report(run: Run) -> None:
     click.echo(f"metrics, tables and provenance: {run.folder}")
 
 
-@cli.command()
-@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
-def report(folder: Path) -> None:
-    """Print the tables of every run under FOLDER."""
+@cli.command(short_help="Print the tables of finished runs, or write all of it as pages.")
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False), default="results/runs")
+@click.option(
+    "--html", is_flag=True, help="Write FOLDER/report/index.html, which needs no network, and print its path."
+)
+@click.option("--dataset", metavar="a,b", help="With --html: only these; every reported one when left out.")
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1), help="Worker processes of --html.")
+def report(folder: Path, html: bool, dataset: str | None, jobs: int) -> None:
+    """Print the tables of every run under FOLDER (results/runs when left out), or write its pages."""
     from study.results.run import find_runs, visible
 
+    if html:
+        from study.report import write_report
+
+        chosen = None if dataset is None else [name.strip() for name in dataset.split(",")]
+        click.echo(f"report: {write_report(folder, chosen, n_jobs=jobs, show_progress=True)}")
+        return
     for run in find_runs(folder):
         click.echo(f"\n## {run.folder.relative_to(folder)}")
         _report(run)
@@ -206,21 +256,8 @@ def anatomy(dataset: str, out: Path) -> None:
     click.echo(f"{len(table)} measurements of {len(people.names())} subjects: {out}")
 
 
-@cli.command(short_help="Check a run against a reference.")
-@click.argument("reference", type=click.Path(path_type=Path))
-@click.argument("candidate", type=click.Path(path_type=Path))
-def compare(reference: Path, candidate: Path) -> None:
-    """Check a run against a reference.
-
-    Every value and every method's mean must be within its metric's tolerance, and the methods in the same order.
-
-    Exit code 0: agrees; 1: differs, the largest differences are listed; 2: can't be compared.
-    """
-    from study.results.compare import compare as compare_runs
-
-    comparison = compare_runs(reference, candidate)
-    click.echo(comparison.report())
-    click.get_current_context().exit(comparison.exit_code)
+cli.add_command(compare)
+cli.add_command(rerun)
 
 
 @cli.command(short_help="Register two clouds of one's own.")
@@ -264,7 +301,7 @@ def register(
     """
     from study.files.register_files import register_files
 
-    towards = None if front is None else _direction(front)
+    towards = None if front is None else _numbers(front, "--front", "X,Y,Z", 3)
     lines, warnings = register_files(
         ct, us, out, method=method, waypoints=waypoints, radius_mm=radius, front=towards, seed=seed, field=field
     )
@@ -274,22 +311,30 @@ def register(
         click.echo(f"study: warning: {warning}", err=True)
 
 
-def _direction(text: str) -> list[float]:
-    """Three numbers of an option."""
+def _numbers(text: str, option: str, shape: str, n: int) -> list[float]:
+    """The numbers of an option, as many as it has."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != 3:
-        raise StudyError(f"--front: expected three numbers as in 0,1,0, got {text!r}; give it as X,Y,Z")
+    if len(numbers) != n:
+        raise StudyError(
+            f"{option}: expected {n} numbers as in {','.join('012'[:n])}, got {text!r}; give it as {shape}"
+        )
     return numbers
 
 
 @cli.command(short_help="Cartilage cloud of a CT of one's own.")
 @click.argument("ct", type=click.Path(path_type=Path))
-@click.option("--labels", type=click.Path(path_type=Path), help="Label volume on the CT's grid.")
+@click.option(
+    "--labels",
+    type=click.Path(path_type=Path),
+    help="Label volume on the CT's grid, or a folder of masks as TotalSegmentator writes it.",
+)
 @click.option("--label-map", default="totalsegmentator_v2", show_default=True, help="Names of the label ids.")
-@click.option("--landmarks", type=click.Path(path_type=Path), help="Landmark file, as in annotations/.")
+@click.option(
+    "--landmarks", type=click.Path(path_type=Path), help="Landmark file as in annotations/, or Slicer's points."
+)
 @click.option("--points", default=9000, show_default=True, type=click.IntRange(min=500))
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Cloud to write, .ply.")
@@ -308,6 +353,57 @@ def cloud(
     anatomy = read_anatomy(ct, points, rng, labels=labels, ids=ids, landmarks=landmarks)
     write_ply(anatomy.cloud, out)
     click.echo(f"{len(anatomy.cloud)} points of sternum and cartilages 2-5, mm RAS+: {out}")
+
+
+@cli.command(short_help="Pictures and places for the landmarks of a CT.")
+@click.argument("ct", type=click.Path(path_type=Path))
+@click.option("--pick", "picks", multiple=True, metavar="X,Z", help="Place in the front view; may be given many times.")
+@click.option(
+    "--slice", "heights", multiple=True, type=float, metavar="Z", help="Axial slice to draw; may be repeated."
+)
+@click.option("--check", type=click.Path(path_type=Path), help="Landmark file, or Slicer's points: draw what grows.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder of pictures.")
+def landmarks(
+    ct: Path, picks: tuple[str, ...], heights: tuple[float, ...], check: Path | None, out: Path | None
+) -> None:
+    """Draw the front of a chest, turn picks in it into millimetres, and check a landmark file.
+
+    \b
+    study landmarks CT --out pictures                      front.png, to read x and z from
+    study landmarks CT --pick 33.5,-85.6 --pick -30,-86    x, y, z of places in it, a line each
+    study landmarks CT --slice -120 --out pictures         slices.png, to read x and y from
+    study landmarks CT --check mine.yaml --out pictures    check-front.png and check-panels.png: what grows from it
+    """
+    from study.ct.growth import parts_from_landmarks
+    from study.ct.wall import anterior_wall_image
+    from study.figures.canvas import png
+    from study.figures.landmarks import axial_slices, chest_front, landmark_panels
+    from study.files.atomic import write_bytes
+    from study.files.landmarks import read_landmarks
+    from study.files.volumes import read_volume
+
+    if out is None and (heights or check or not picks):
+        raise StudyError("expected --out, the folder of the pictures, got none; add it, or ask for --pick X,Z alone")
+    places = [_numbers(pick, "--pick", "X,Z", 2) for pick in picks]
+    placed = None if check is None else read_landmarks(check)
+    image = read_volume(ct)
+    wall = anterior_wall_image(image)
+    for x, z in places:
+        click.echo("[{:.1f}, {:.1f}, {:.1f}]".format(*wall.pick(x, z)))
+    if out is None:
+        return
+    figures = {}
+    if heights:
+        figures["slices"] = axial_slices(image, heights)
+    if placed is not None:
+        grown = parts_from_landmarks(image, placed)
+        figures["check-front"] = chest_front(wall, placed, grown)
+        figures["check-panels"] = landmark_panels(image, placed, grown)
+    if not figures:
+        figures["front"] = chest_front(wall)
+    for name, figure in figures.items():
+        write_bytes(out / f"{name}.png", png(figure))
+        click.echo(out / f"{name}.png")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -345,7 +441,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return UNFORESEEN
     return code or 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
