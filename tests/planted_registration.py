@@ -30,6 +30,7 @@ def planted(*, field: bool = True) -> Registration:
     bend = Bend(T_US_CT)
     warped = bend.apply(T_US_CT.apply(SOURCE))
     about = {"method": "planted", "front": T_US_CT.rotation[:, 1], "parts": np.arange(len(SOURCE)) % 9}
+    about["target"] = warped + 0.5 * T_US_CT.rotation[:, 1]
     if field:
         return FieldRegistration(SOURCE, warped, T_US_CT, True, 1, "planted", **about, field=bend)
     return Registration(SOURCE, warped, T_US_CT, True, 1, "planted", **about)

@@ -60,7 +60,7 @@ def test_normals_are_those_of_the_skin() -> None:
     _, expected = skin.points(way.points @ skin.axes[:2].T)
     T = RigidTransform.random(rng)
     own = Registration(us, T.apply(us), T, True, 0, "known", front=T.rotation[:, 1])
-    guided = guide(own, T.apply(us), way)
+    guided = guide(replace(own, target=T.apply(us)), way)
     cosine = (guided.normals * (expected @ T.rotation.T)).sum(axis=1)
     assert guided.from_surface.all()
     assert np.degrees(np.arccos(cosine)).max() < 25.0
@@ -71,7 +71,7 @@ def test_normals_are_those_of_the_skin() -> None:
 def test_where_no_ultrasound_is_the_normal_is_the_chests_front() -> None:
     result = planted()
     far = result.warped[np.linalg.norm(SOURCE - SOURCE[0], axis=1) > 60]
-    guided = guide(result, far, PATH)
+    guided = guide(replace(result, target=far), PATH)
     assert not guided.from_surface[0]
     assert np.array_equal(guided.normals[0], result.front)
     assert (guided.n_us[0], np.isnan(guided.residual_mm[0])) == (0, True)
@@ -81,7 +81,7 @@ def test_quality_of_each_waypoint_and_no_bounds_where_a_method_has_none() -> Non
     result = planted()
     path = Waypoints(np.vstack([SOURCE[0], SOURCE[1] + [0, 9000, 0], SOURCE[2]]), ("a", "far", "c"))
     lifted = result.warped + 2.0 * result.front
-    guided = guide(result, lifted, path)
+    guided = guide(replace(result, target=lifted), path)
     assert guided.bounds_mm is None
     assert guided.ct_distance_mm[[0, 2]].tolist() == [0, 0]
     assert guided.reasons[0] == ""
@@ -90,9 +90,9 @@ def test_quality_of_each_waypoint_and_no_bounds_where_a_method_has_none() -> Non
     assert np.isnan(guided.normals[1]).all()
     assert 0.5 < guided.residual_mm[0] <= 2.0
     assert np.allclose(guided.points[0], result.warped[0])
-    with pytest.raises(StudyError, match=r"`front` is None"):
-        guide(replace(result, front=None), lifted, path)
+    with pytest.raises(StudyError, match=r"without `front` and `target`"):
+        guide(replace(result, front=None), path)
     with pytest.raises(StudyError, match="metres"):
-        guide(result, lifted, Waypoints(SOURCE[:3] / 1e6, ("a", "b", "c")))
+        guide(result, Waypoints(SOURCE[:3] / 1e6, ("a", "b", "c")))
     with pytest.raises(StudyError, match="expected one or more that can be carried, got none: far"):
-        guide(result, lifted, Waypoints(path.points[1:2], ("far",)))
+        guide(result, Waypoints(path.points[1:2], ("far",)))

@@ -45,20 +45,22 @@ class GuidedPath:
     n_us: Ints
 
 
-def guide(result: Registration, us: Floats, waypoints: Waypoints, radius_mm: float = 20.0) -> GuidedPath:
+def guide(result: Registration, waypoints: Waypoints, radius_mm: float = 20.0) -> GuidedPath:
     """Carry waypoints into the US frame, and look at the ultrasound around each.
 
     Args:
-        result: of `study.register_pair`, whose ``front`` is known.
-        us: (m, 3) mm, the US points.
+        result: of `study.register_pair`, whose ``front`` and ``target`` are known.
         waypoints: mm, CT frame.
         radius_mm: sphere of the path transfer (sec. III-D).
 
     Raises:
-        StudyError: a result without ``front``; waypoints in metres; not one that can be carried.
+        StudyError: a result without them; waypoints in metres; not one that can be carried.
     """
-    if result.front is None:
-        raise StudyError("expected a registration of study.register_pair, got one whose `front` is None; use that")
+    us = result.target
+    if result.front is None or us is None:
+        raise StudyError(
+            "expected a registration of study.register_pair, got one without `front` and `target`; use that"
+        )
     path = result.carry_path(waypoints.points, radius_mm)
     carried = np.array([not reason for reason in path.reasons])
     if not carried.any():

@@ -90,6 +90,7 @@ def register_pair(
     given, seen = _as_cloud(ct, "ct"), _as_cloud(us, "us", front, times)
     alignment = Alignment(_even_chest(given), _even_chest(seen))
     result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
+    result = replace(result, target=seen.points)
     if len(alignment.source.cloud) == len(given):
         return result
     _, like = nearest(given.points, result.source)
@@ -182,6 +183,7 @@ def register_aligned(
         converged=result.converged and quality.wrong_part_share <= QUALITY_LIMITS[SWAPPED][0],
         parts=source.parts,
         front=alignment.target.T_cloud_chest.rotation[:, 2],
+        target=alignment.target.cloud.points,
     )
 
 

@@ -151,7 +151,8 @@ class Registration:
         warnings: sentences, each on one thing that makes the answer suspect; empty when nothing does.
         quality: measures of the result that need no truth; `study.pipeline.register_aligned` sets both.
         parts: (n,) `Part` of each CT point, as the coarse alignment named it; it sets this, and
-        front: (3,) unit vector from the chest to the skin in the US frame; None of a method that ran by itself.
+        front: (3,) unit vector from the chest to the skin in the US frame, and
+        target: (m, 3) mm, the US points as given; None of a method that ran by itself.
 
     A notebook shows one as a few lines and a picture. Its verb is path transfer:
 
@@ -177,6 +178,7 @@ class Registration:
     quality: Quality | None = None
     parts: Ints | None = None
     front: Floats | None = None
+    target: Floats | None = None
 
     def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
         """`carry_path` of waypoints that must all be good: (k, 3) mm in the US frame.

@@ -19,7 +19,7 @@ from study.errors import StudyError
 from study.files import registered
 from study.files.clouds import read_ply
 from study.files.meanings import FILES
-from study.files.registered import Request, check_outputs, describe, write_registration
+from study.files.registered import Request, check_outputs, describe, write_registration, write_result
 from study.files.transforms import grid_around
 from study.files.waypoints import WaypointFile, read_waypoint_file
 from study.quality import Quality
@@ -32,7 +32,7 @@ PATH = WaypointFile(Waypoints(SOURCE[:4], ("R2-3.1", "R2-3.2", "L2-3.1", "L2-3.2
 
 
 def written(folder: Path, result: Registration, **options: Any) -> tuple[list[str], list[str]]:
-    return write_registration(result, result.warped + 0.5 * result.front, folder, REQUEST, **options)
+    return write_result(replace(result, target=result.warped + 0.5 * result.front), folder, REQUEST, **options)
 
 
 def content(folder: Path, name: str) -> Any:
@@ -145,6 +145,8 @@ def test_a_bad_waypoint_is_flagged_and_the_good_ones_survive(tmp_path: Path) -> 
     result = Registration(SOURCE, T.apply(SOURCE), T, True, 7, "at rest", front=T.rotation[:, 1])
     points = np.vstack([SOURCE[:1], [[9e3, 0, 0]], SOURCE[1:2]])
     path = WaypointFile(Waypoints(points, ("R2-3.1", "far", "R2-3.2")), "RAS", ("", "", ""))
+    plain = replace(result, target=result.warped)
+    assert write_registration(plain, tmp_path / "out", path.waypoints)[-1].startswith("waypoint not carried: far: ")
     _, warnings = written(tmp_path / "out", result, waypoints=path)
     assert warnings[0].startswith("waypoint not carried: far: expected at least 3 CT points")
     table = pd.read_csv(tmp_path / "out" / "waypoints_us.csv", keep_default_na=False, na_values={"x": ""})

@@ -17,7 +17,8 @@ FILES = {
 FRAMES = {
     "CT": "the frame of the CT points, mm; x, y, z as in the file where it says comment SPACE=RAS or nothing, with x "
     "and y of the opposite sign where it says LPS",
-    "US": "the frame of the US points, mm, by the same rule: of a sweep the base frame of its tracker or robot",
+    "US": "the frame of the US points, mm, of a sweep the base frame of its tracker or robot; x, y, z as in their "
+    "file where it says comment SPACE=RAS or nothing, with x and y of the opposite sign where it says LPS",
 }
 
 MEANINGS = {

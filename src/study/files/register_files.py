@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from study import pipeline
 from study.files.clouds import PlyFile, read_ply_file
-from study.files.registered import Request, check_outputs, describe, write_registration
+from study.files.registered import Request, check_outputs, describe, write_result
 from study.files.transforms import grid_around, read_grid
 from study.files.waypoints import read_waypoint_file
 from study.geometry.points import unit
@@ -27,7 +27,7 @@ def register_files(
     seed: int = 0,
     field: str | None = None,
 ) -> tuple[list[str], list[str]]:
-    """Register two PLY files (`study.register_pair`) and write the result; see `write_registration`.
+    """Register two PLY files (`study.register_pair`) and write the result; see `write_result`.
 
     Args:
         ct: PLY of the CT points.
@@ -65,9 +65,7 @@ def register_files(
     if spacing_mm is not None:
         grid = grid_around(result.warped, spacing_mm)
     request = Request(inputs, asdict(chosen), seed, None if towards is None else towards.tolist(), radius_mm)
-    lines, warnings = write_registration(
-        result, seen.points, out, request, waypoints=path, grid=grid, faces=person.faces
-    )
+    lines, warnings = write_result(result, out, request, waypoints=path, grid=grid, faces=person.faces)
     untagged = [file.name for file, read in ((ct, person), (us, seen)) if read.space is None]
     if untagged:
         lines.append(f"no comment SPACE= in {', '.join(untagged)}: taken as RAS")

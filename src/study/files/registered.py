@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from study.files.waypoints import WaypointFile, csv_text, markups
 from study.geometry.points import nearest
 from study.guidance import NEIGHBOURS, GuidedPath, guide
 from study.registration import REACH_MM, FieldRegistration, Registration
-from study.types import Floats, Ints, PointCloud
+from study.types import Ints, PointCloud, Waypoints
 
 NOT_CARRIED = "waypoint not carried"
 SUMMARY = "registration.json"
@@ -34,15 +34,15 @@ class Request:
 
     Attributes:
         inputs: what is known of each input file, by what it is: ``"ct"``, ``"us"``, ``"waypoints"``, ``"field"``.
-        parameters: of the method.
+        parameters: of the method; None where it was not said, as
         seed: of the draws.
         front: direction to the probe, where it was given.
         radius_mm: sphere of the path transfer.
     """
 
-    inputs: Mapping[str, Mapping[str, Any]]
-    parameters: Mapping[str, Any]
-    seed: int
+    inputs: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    parameters: Mapping[str, Any] | None = None
+    seed: int | None = None
     front: list[float] | None = None
     radius_mm: float = 20.0
 
@@ -53,8 +53,29 @@ def describe(path: str | os.PathLike[str], **known: Any) -> dict[str, Any]:
 
 
 def write_registration(
+    result: Registration, folder: Path, waypoints: Waypoints | None = None, radius_mm: float = 20.0
+) -> list[str]:
+    """Write a registration that was made in Python: `write_result`, without what only a file can tell.
+
+    Args:
+        result: of `study.register_pair`.
+        folder: where to write.
+        waypoints: mm, CT frame.
+        radius_mm: sphere of the path transfer (sec. III-D).
+
+    Returns:
+        a line for each file, saying what it is, and one for each waypoint that was not carried.
+
+    Raises:
+        StudyError: not one waypoint can be carried; nothing is written.
+    """
+    given = None if waypoints is None else WaypointFile(waypoints, "RAS", ("",) * len(waypoints))
+    lines, told = write_result(result, folder, Request(radius_mm=radius_mm), waypoints=given)
+    return [*lines, *(one for one in told if one.startswith(NOT_CARRIED))]
+
+
+def write_result(
     result: Registration,
-    us: Floats,
     folder: Path,
     request: Request,
     *,
@@ -69,7 +90,6 @@ def write_registration(
 
     Args:
         result: of `study.register_pair`.
-        us: (m, 3) mm, the US points as given.
         folder: where to write.
         request: what it was made of.
         waypoints: of the CT frame.
@@ -82,30 +102,31 @@ def write_registration(
     Raises:
         StudyError: not one waypoint can be carried, or a grid elsewhere than the result; nothing is written.
     """
-    guided = None if waypoints is None else guide(result, us, waypoints.waypoints, request.radius_mm)
-    field = None if grid is None else sample_field(result, grid)
+    guided = None if waypoints is None else guide(result, waypoints.waypoints, request.radius_mm)
+    sampled = None if grid is None else sample_field(result, grid)
     suspect = [*result.warnings, *([] if result.converged else [f"not converged: {result.stop_reason}"])]
-    told = [] if field is None else _field_warnings(field)
+    told = [] if sampled is None else _field_warnings(sampled)
     if guided is not None and waypoints is not None:
         reasons = zip(waypoints.waypoints.labels, guided.reasons, strict=True)
         told += [f"{NOT_CARRIED}: {label}: {reason}" for label, reason in reasons if reason]
     with filling(folder, list(FILES), SUMMARY) as new:
-        _write_cloud(result, us, faces, new)
+        _write_cloud(result, faces, new)
         write_rigid(result.T_us_ct, new / "rigid.tfm")
         if guided is not None and waypoints is not None:
             _write_waypoints(guided, waypoints, result, suspect, new)
-        if field is not None:
-            write_field(field, new / "displacement.nii.gz")
+        if sampled is not None:
+            write_field(sampled, new / "displacement.nii.gz")
         made = [name for name in FILES if (new / name).is_file() or name == SUMMARY]
-        write_json(_summary(result, request, [*result.warnings, *told], field, made), new / SUMMARY)
+        write_json(_summary(result, request, [*result.warnings, *told], sampled, made), new / SUMMARY)
     return [f"{FILES[name]}: {folder / name}" for name in made], [*told, *suspect]
 
 
-def _write_cloud(result: Registration, us: Floats, faces: Ints | None, folder: Path) -> None:
+def _write_cloud(result: Registration, faces: Ints | None, folder: Path) -> None:
     """``warped.ply``, with the displacement that the rigid part leaves and the distance to the ultrasound."""
     moved = result.warped - result.T_us_ct.apply(result.source)
     columns = {f"displacement_{axis}": moved[:, k] for k, axis in enumerate("xyz")}
-    columns["us_distance"] = nearest(result.warped, us)[0]
+    if result.target is not None:
+        columns["us_distance"] = nearest(result.warped, result.target)[0]
     write_ply(PointCloud(result.warped, "warped", result.parts), folder / "warped.ply", faces=faces, columns=columns)
 
 
@@ -154,7 +175,7 @@ def _robot_waypoint(guided: GuidedPath, k: int, label: str, suspect: bool) -> di
 
 
 def _summary(
-    result: Registration, request: Request, warnings: list[str], field: Field | None, made: list[str]
+    result: Registration, request: Request, warnings: list[str], sampled: Field | None, made: list[str]
 ) -> dict[str, Any]:
     """The content of ``registration.json``."""
     bent_mm = np.linalg.norm(result.warped - result.T_us_ct.apply(result.source), axis=1)
@@ -163,7 +184,7 @@ def _summary(
         "format_version": 1,
         "study_version": study.__version__,
         "method": result.method,
-        "parameters": dict(request.parameters),
+        "parameters": None if request.parameters is None else dict(request.parameters),
         "seed": request.seed,
         "front": request.front,
         "radius_mm": request.radius_mm,
@@ -178,7 +199,7 @@ def _summary(
         "T_us_ct_is": "the rigid part of the result only, CT frame to US frame, mm; no probe should follow it",
         "T_us_ct_is_all": bool(bent_mm.max() < WHOLE_MM),
         "beyond_rigid_mm": {"mean": float(bent_mm.mean()), "max": float(bent_mm.max())},
-        "field": None if field is None else _about(field, result),
+        "field": None if sampled is None else _about(sampled, result),
         "files": {name: FILES[name] for name in made},
         "frames": FRAMES,
         "meaning": MEANINGS,

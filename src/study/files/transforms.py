@@ -25,7 +25,7 @@ from study.guidance import pull_back
 from study.registration import Registration
 from study.types import Floats, RigidTransform
 
-KNOT_MM = 4.0  # between places at which the field is worked out; between them it is interpolated, and bends far less
+KNOT_MM = 8.0  # between places at which the field is worked out; interpolating between them costs up to 0.3 mm
 MARGIN_MM = 20.0  # of a grid of one's own around the warped cloud
 MAX_VOXELS = 50_000_000
 MAX_GRID_MM = 20.0  # spacing of a grid of one's own
