@@ -86,10 +86,12 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 def test_calls_come_back_as_from_here(cluster: Cluster) -> None:
     calls = {"a": (math.sqrt, 4.0), "b": (math.sqrt, -1.0), "c": (math.sqrt, Outcome(9.0))}
     calls["d"] = (math.sqrt, Outcome(error=StudyError("no sternum")))
+    calls["e"] = (os.getpid,)
     told = []
     found = Workers(1, False, cluster.address).run("roots", calls, lambda key, _: told.append(key))
     here = Workers(1, False).run("roots", calls)
-    assert [outcome.value for outcome in found.values()] == [2.0, None, 3.0, None]
+    pid = cluster.processes["one"].pid  # of one worker, too, nothing is computed here
+    assert [outcome.value for outcome in found.values()] == [2.0, None, 3.0, None, pid]
     assert {key: str(outcome.error) for key, outcome in found.items()} == {
         key: str(outcome.error) for key, outcome in here.items()
     }
