@@ -48,7 +48,7 @@ def connected(address: str) -> Iterator[None]:
 
 
 def _backend(client: Any) -> Any:
-    """Joblib's back end for this cluster, of one worker, too, for which joblib would compute in this process instead."""
+    """Joblib's back end for this cluster; with one worker, too, where joblib would compute in this process instead."""
     from joblib._dask import DaskDistributedBackend  # registered by name only, and a name takes no subclass
 
     class Cluster(DaskDistributedBackend):  # type: ignore[misc]
