@@ -61,6 +61,7 @@ def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) ->
     assert set(metrics["status"]) <= {"ok", "not converged"}
     assert (tmp_path / "metrics.csv").read_bytes() == (first / "metrics.csv").read_bytes()
     assert (tmp_path / "hd_table.md").read_bytes() == (first / "hd_table.md").read_bytes()
+    assert (tmp_path / "clouds.npz").read_bytes() == (first / "clouds.npz").read_bytes()
 
 
 def test_one_method_alone_has_the_rows_it_has_among_others(first: Path) -> None:
@@ -90,7 +91,7 @@ def test_another_seed_gives_other_numbers(first: Path) -> None:
 
 def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
     assert {path.name for path in first.iterdir()} == {
-        "metrics.csv", "timings.csv", "provenance.json", "hd_table.csv", "hd_table.md", "hd_table.tex",
+        "metrics.csv", "timings.csv", "provenance.json", "clouds.npz", "hd_table.csv", "hd_table.md", "hd_table.tex",
         "parameters.json", "manifest.yaml", "environment.lock", "ro-crate-metadata.json",
     }  # fmt: skip
     assert " n " in (first / "hd_table.md").read_text(encoding="utf-8")

@@ -91,8 +91,8 @@ def test_every_figure_is_small_says_mm_and_leaves_no_global_state(name: str) -> 
     assert isinstance(figure, figures.StudyFigure)
     image = figures.png(figure)
     assert image[:4] == b"\x89PNG"
-    assert len(image) < 150_000
-    assert Image.open(io.BytesIO(image)).width == 990
+    assert len(image) < 250_000
+    assert Image.open(io.BytesIO(image)).width == 1650
     assert "mm" in texts(figure)
     assert dict(matplotlib.rcParams) == before
 

@@ -1,4 +1,4 @@
-"""The command line: data, run, compare, rerun, register, cloud, report."""
+"""The command line: data, run, notebooks, compare, rerun, register, cloud, report."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import click
 
 from study import __version__
 from study.cli.comparing import compare, rerun
+from study.cli.notebooks import notebooks
 from study.errors import StudyError
 from study.offline import go_offline
 
@@ -37,6 +38,9 @@ def cli(context: click.Context, traceback: bool, offline: bool) -> None:
         context.obj["traceback"] = traceback
     if offline:
         go_offline()
+
+
+cli.add_command(notebooks)
 
 
 @cli.group()
@@ -179,12 +183,23 @@ def _report(run: Run) -> None:
     click.echo(f"metrics, tables and provenance: {run.folder}")
 
 
-@cli.command()
-@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
-def report(folder: Path) -> None:
-    """Print the tables of every run under FOLDER."""
+@cli.command(short_help="Print the tables of finished runs, or write all of it as pages.")
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False), default="results/runs")
+@click.option(
+    "--html", is_flag=True, help="Write FOLDER/report/index.html, which needs no network, and print its path."
+)
+@click.option("--dataset", metavar="a,b", help="With --html: only these; every reported one when left out.")
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1), help="Worker processes of --html.")
+def report(folder: Path, html: bool, dataset: str | None, jobs: int) -> None:
+    """Print the tables of every run under FOLDER (results/runs when left out), or write its pages."""
     from study.results.run import find_runs, visible
 
+    if html:
+        from study.report import write_report
+
+        chosen = None if dataset is None else [name.strip() for name in dataset.split(",")]
+        click.echo(f"report: {write_report(folder, chosen, n_jobs=jobs, show_progress=True)}")
+        return
     for run in find_runs(folder):
         click.echo(f"\n## {run.folder.relative_to(folder)}")
         _report(run)

@@ -55,7 +55,7 @@ def read_landmarks(path: str | os.PathLike[str]) -> Landmarks:
         raw, root = read_yaml(path)
     except FileNotFoundError as error:
         raise StudyError(
-            f"expected a landmark file at {path}, got nothing there; make one as the README shows"
+            f"expected a landmark file at {path}, got nothing there; make one as docs/use.md shows"
         ) from error
     if faults := repeated_keys(root):
         raise located(faults, root, path.name)

@@ -20,6 +20,7 @@ from study.files.atomic import json_text, sha256_of, write_bytes, write_json, wr
 from study.files.places import CHECKOUT
 from study.naming import split_sweep
 from study.results.claim import PROVENANCE, Claim, claimed
+from study.results.clouds import CLOUDS, CaseName, Clouds, write_clouds
 from study.results.compare import Comparison, compare
 from study.results.crate import CRATE, crate_text
 from study.results.metrics_csv import (
@@ -249,12 +250,28 @@ class Run:
         """Another run against this one as the reference, see `study.results.compare.compare`."""
         return compare(self.folder, candidate.folder)
 
+    def clouds(self) -> Clouds:
+        """Where every case put its points, see `study.results.clouds`.
+
+        Raises:
+            StudyError: the run kept none, or they are not as it left them.
+        """
+        path = self.folder / CLOUDS
+        if not path.is_file():
+            raise StudyError(f"expected the clouds of a run at {path}, got none; run the data set again")
+        if self.provenance.get("clouds_sha256") != sha256_of(path):
+            raise StudyError(f"{path}: expected the file that the run wrote, got another one; run the data set again")
+        return Clouds(path)
+
     def tables(self) -> list[Path]:
         """The Markdown tables beside the metrics."""
         return sorted(self.folder.glob("hd_table*.md"))
 
     def keep_figures(self, pictures: Mapping[str, bytes]) -> list[str]:
-        """Write PNG pictures of this run beside its metrics, and their hashes into its provenance; their file names.
+        """Write pictures of this run beside its metrics, and their hashes into its provenance; their file names.
+
+        Args:
+            pictures: by file name, as `study.figures.picture_files` gives them.
 
         Raises:
             StudyError: the folder holds another run by now, or one that was altered.
@@ -297,6 +314,7 @@ def write_run(
     provenance: Mapping[str, Any],
     failures: str = "",
     copies: Mapping[str, Path] | None = None,
+    clouds: Mapping[CaseName, str] | None = None,
 ) -> Run:
     """Write everything that tells of a run that has just ended, and describes it, all at once.
 
@@ -307,6 +325,8 @@ def write_run(
         provenance: see `study.results.provenance.provenance`; the hashes of the run's files are added.
         failures: tracebacks of cases that failed in a way nobody foresaw.
         copies: files that it was made with and that belong beside it, by the name they get.
+        clouds: of each case, as `study.results.clouds.pack` gives them; none are kept where there are none. Their hash
+            stands by itself in the provenance: a run whose clouds were left out of a copy is not an altered one.
 
     Raises:
         StudyError: rows that are not of the schema, or a file of somebody else's in the way; nothing is changed then.
@@ -320,7 +340,11 @@ def write_run(
     write_json(provenance["parameters"], new / "parameters.json")
     for name, path in (copies or {}).items():
         write_bytes(new / name, path.read_bytes())
-    _seal(new, [path.name for path in new.iterdir()], provenance)
+    names = [path.name for path in new.iterdir()]
+    if clouds:
+        write_clouds(clouds, new / CLOUDS)
+        provenance = {**provenance, "clouds_sha256": sha256_of(new / CLOUDS)}
+    _seal(new, names, provenance)
     claim.swap_in()
     return Run(claim.folder)
 
@@ -360,10 +384,10 @@ def newest(dataset: str, profile: str, seed: int) -> Run | None:
 
 
 def keep_pictures(folder: Path, pictures: Mapping[str, bytes]) -> list[str]:
-    """Write PNG pictures into a folder; their file names."""
+    """Write pictures, by file name, into a folder; their file names."""
     for name, content in pictures.items():
-        write_bytes(folder / f"{name}.png", content)
-    return [f"{name}.png" for name in pictures]
+        write_bytes(folder / name, content)
+    return list(pictures)
 
 
 def against_reference(run: Run, *, comparable: bool) -> str:

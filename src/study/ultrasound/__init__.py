@@ -1,5 +1,6 @@
 """Tracked ultrasound (sec. II): calibrations, masks to cloud; the virtual sweep and the sizes of its errors."""
 
+from study.ultrasound.b_mode import b_mode_like, ct_frame, frame_below, frame_of
 from study.ultrasound.cloud import SweepCloud, SweepReport, contour_points, sweep_cloud, thin_evenly, upper_contour
 from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.probe import Probe
@@ -21,12 +22,16 @@ __all__ = [
     "SweepErrors",
     "SweepReport",
     "TrackedSweep",
+    "b_mode_like",
     "budget_cases",
     "calibrate_latency",
     "calibrate_spatial",
     "constant_shift_mm",
     "contour_points",
+    "ct_frame",
     "error_table",
+    "frame_below",
+    "frame_of",
     "simulate_calibration_views",
     "simulate_latency_run",
     "simulate_sweep",
