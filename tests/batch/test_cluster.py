@@ -57,11 +57,10 @@ class Cluster:
         self.client = distributed.Client(scheduler_file=str(self.file), set_as_default=False, timeout=PATIENCE_S)
         self.address = self.client.scheduler.address
 
-    def busy(self, name: str) -> bool:
-        """Whether a worker is at work."""
+    def where(self, name: str) -> str:
+        """The address of a worker."""
         workers = self.client.scheduler_info(n_workers=-1)["workers"]
-        where = next(address for address, worker in workers.items() if worker["name"] == name)
-        return bool(self.client.processing().get(where))
+        return next(address for address, worker in workers.items() if worker["name"] == name)
 
     def _wait(self, there: object) -> None:
         end = time.monotonic() + PATIENCE_S
@@ -112,12 +111,13 @@ def test_a_run_with_a_killed_worker_is_the_local_run(
     monkeypatch.setattr(phantom, "ct_volume", cached_ct_volume)
     people = find_dataset("phantom", SMALL, 0)
     run_study(people, tmp_path / "here", methods=METHODS)
-    journal, killed = tmp_path / ".there.unfinished" / "finished.jsonl", threading.Event()
+    killed = threading.Event()
     cluster.worker("two")
+    where = cluster.where("two")
 
     def kill() -> None:
-        while not (journal.exists() and journal.read_bytes().count(b"\n") >= 2 and cluster.busy("two")):
-            time.sleep(0.005)
+        while not cluster.client.processing().get(where):  # it has a case in its hands
+            time.sleep(0.001)
         cluster.end("two")
         killed.set()
 
