@@ -17,7 +17,7 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export NUMEXPR_NUM_THREADS := 1
 
-.PHONY: help setup study evidence test check notebooks reference bench lab lock clean
+.PHONY: help setup study results evidence test check notebooks reference bench lab lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -28,10 +28,12 @@ $(STAMP): environment.lock pyproject.toml tools/setup.sh tools/check_system.py
 	@bash tools/setup.sh $(VENV)
 	@touch $@
 
-study: $(STAMP)  ## run the whole study: the notebooks; ends with the finding, the report, the comparison
+study: results  ## run the whole study: the notebooks; ends with the finding, the report, the comparison
+	$(BIN)/study compare results/reference $(RUNS)
+
+results: $(STAMP)
 	$(BIN)/study notebooks --jobs $(JOBS) --out $(RUNS)/notebooks
 	$(BIN)/study report --html $(RUNS)
-	$(BIN)/study compare results/reference $(RUNS)
 
 evidence: $(STAMP)  ## robustness, sensitivity, more people: up to 90 minutes on 2 cores, goes on where it was stopped
 	$(BIN)/study evidence --out $(EVIDENCE) --jobs $(JOBS)
@@ -51,7 +53,7 @@ check: $(STAMP)  ## ruff, types, import layers, notebook pairing
 notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
 	$(BIN)/python tools/notebooks.py write --jobs $(JOBS)
 
-reference: study  ## run the study, renew results/reference and results/evidence, draft the CHANGELOG rows
+reference: results  ## run the study, renew results/reference and results/evidence, draft the CHANGELOG rows
 	$(BIN)/python tools/reference.py --runs $(RUNS)
 	for part in robustness sensitivity people; do if [ -d $(EVIDENCE)/$$part ]; then \
 	  mkdir -p results/evidence && rm -rf results/evidence/$$part && cp -r $(EVIDENCE)/$$part results/evidence/$$part; \

@@ -89,7 +89,7 @@ def refused(capsys: Capture, *arguments: str | Path) -> str:
 
 @pytest.mark.parametrize(
     "words",
-    [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"], ["datasets"], ["evidence"],
+    [[], ["data"], ["run"], ["compare"], ["rerun"], ["register"], ["cloud"], ["report"], ["datasets"], ["evidence"],
      ["landmarks"], ["data", "init"], ["data", "list"], ["data", "fetch"], ["data", "verify"]],
     ids=" ".join,
 )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -22,7 +22,7 @@ from study.naming import split_sweep
 from study.results.claim import PROVENANCE, Claim, claimed
 from study.results.clouds import CLOUDS, CaseName, Clouds, write_clouds
 from study.results.compare import Comparison, compare
-from study.results.crate import CRATE, crate_text
+from study.results.crate import seal
 from study.results.metrics_csv import (
     CASE,
     FAILED,
@@ -290,7 +290,7 @@ class Run:
                     f"{self.folder}: expected the run as it was made, but it {there.altered}; run it again"
                 )
             names = keep_pictures(self.folder, pictures)
-            _seal(self.folder, [*there.provenance["files_sha256"], *names], there.provenance)
+            seal(self.folder, [*there.provenance["files_sha256"], *names], there.provenance)
         return names
 
     def _repr_html_(self) -> str:
@@ -349,17 +349,9 @@ def write_run(
     if clouds:
         write_clouds(clouds, new / CLOUDS)
         provenance = {**provenance, "clouds_sha256": sha256_of(new / CLOUDS)}
-    _seal(new, names, provenance)
+    seal(new, names, provenance)
     claim.swap_in()
     return Run(claim.folder)
-
-
-def _seal(folder: Path, names: Iterable[str], provenance: Mapping[str, Any]) -> None:
-    """Describe the files of a run, and hold them to what they are now by their hashes."""
-    files = sorted({*names} - {CRATE})
-    write_text(folder / CRATE, crate_text(folder, files, provenance))
-    hashes = {name: sha256_of(folder / name) for name in (*files, CRATE)}
-    write_json({**provenance, "files_sha256": hashes}, folder / PROVENANCE)
 
 
 def find_runs(folder: Path) -> list[Run]:
