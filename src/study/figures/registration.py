@@ -77,7 +77,7 @@ def registration_grid(
         text = f"{method_style(name).label}\nmean {residual[name].mean():.1f}, largest {residual[name].max():.1f} mm"
         panels = grid[k // columns, 2 * (k % columns) :]
         for ax, view, extent, words in zip(panels, views, extents, (text, ""), strict=False):
-            dots(ax, project(us, view, T_us_chest), PALE, size=1.5)
+            dots(ax, project(us[thin(len(us), 1600)], view, T_us_chest), PALE, size=1.5)
             drawn = _by_distance(ax, points, residual[name], view, T_us_chest, top)
             look(ax, view, extent, words)
             ax.set_xlabel("left (mm)" if view == "front" else "front (mm)", fontsize=8)
@@ -93,7 +93,7 @@ def _by_distance(
     ax: Axes, points: Floats, distance: Floats, view: View, T_us_chest: RigidTransform | None, top: float
 ) -> Any:
     """A warped cloud, coloured by its distance to the US cloud."""
-    some = thin(len(points), 2500)
+    some = thin(len(points), 1600)  # more cannot be told apart in a small panel, and weigh
     seen = project(points[some], view, T_us_chest)
     return dots(ax, seen, distance[some], size=2.5, cmap=steps("viridis"), vmin=0, vmax=top)
 
@@ -151,7 +151,7 @@ def pairs_grid(pairs: Mapping[str, PairView], title: str, *, most_mm: float = 12
         us = as_points(pair.target, "target")
         goal = project(pair.goal.points, "front", pair.T_us_chest)
         for ax, method in zip(row, methods, strict=True):
-            dots(ax, project(us, "front", pair.T_us_chest), PALE, size=1.5)
+            dots(ax, project(us[thin(len(us), 1600)], "front", pair.T_us_chest), PALE, size=1.5)
             distance = nearest(pair.warped[method], us)[0]
             drawn = _by_distance(ax, pair.warped[method], distance, "front", pair.T_us_chest, most_mm)
             found = project(_paired(pair.moved[method], pair.goal, method), "front", pair.T_us_chest)
