@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from study import ct, datasets, figures, geometry, params, seeds, ultrasound
-from study.types import Part
+from study.types import CARTILAGES, Part
 
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
@@ -88,12 +88,26 @@ figures.mesh_and_cloud(examples[-1].mesh, examples[-1].cloud)
 
 # %%
 first, wall = examples[0], walls[examples[0].name]
-branch = first.cloud.only(Part.RIGHT_4)
-middle, junction = branch.mean(axis=0), branch[np.argmax(branch[:, 0])]
-beyond = wall.x_mm[np.abs(wall.x_mm - junction[0] - 20.0).argmin()]  # 20 mm farther out it is a rib
-near = np.flatnonzero(np.abs(wall.z_mm - junction[2]) < 20.0)
-on_rib = wall.z_mm[near[wall.image[near, wall.x_mm == beyond].argmax()]]
-places = {"cartilage": middle, "rib": wall.pick(beyond, on_rib)}
+
+
+def on_both(part):
+    """A place in the middle of a cartilage, and one on its rib, 20 mm beyond the junction."""
+    branch, side = first.cloud.only(part), 1 if part.side == "right" else -1
+    junction = branch[np.argmax(side * branch[:, 0])]
+    beyond = wall.x_mm[np.abs(wall.x_mm - junction[0] - 20.0 * side).argmin()]
+    near = np.flatnonzero(np.abs(wall.z_mm - junction[2]) < 15.0)
+    on_rib = wall.z_mm[near[wall.image[near, wall.x_mm == beyond].argmax()]]
+    return {"cartilage": branch.mean(axis=0), "rib": wall.pick(beyond, on_rib)}
+
+
+def rib_depth_mm(places):
+    """How deep its rib lies."""
+    return ultrasound.skin_depth_mm(first.image, places["rib"])
+
+
+# %%
+places = min(map(on_both, CARTILAGES), key=rib_depth_mm)  # where the rib lies least deep
+places["cartilage"] = on_both(Part.RIGHT_4)["cartilage"]  # one that is not calcified
 probe, rng = ultrasound.Probe(), seeds.named_rng(seed, "b-mode")
 frames = {what: ultrasound.frame_below(first.image, first.mask, place, probe, rng) for what, place in places.items()}
 figures.biomarker(fronts[first.name], first.mask, frames, (probe.aperture_mm, probe.depth_mm))

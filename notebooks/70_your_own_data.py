@@ -26,7 +26,7 @@ from study.types import PointCloud
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 folder = CHECKOUT / "samples"
 CT, US, WAYPOINTS = folder / "ct.ply", folder / "us.ply", folder / "waypoints.csv"
-FRONT = (0.9370, 0.0917, 0.3370)  # from the chest to the probe, in the frame of US; None where it is not known
+FRONT = (-0.4642, -0.8610, -0.2077)  # from the chest to the probe, in the frame of US; None where it is not known
 OUT = CHECKOUT / "results" / "trials" / "your_own_data"
 
 # %% [markdown]
@@ -52,8 +52,7 @@ pd.DataFrame(
 # %% [markdown]
 # ## Register
 # `study.BEST_METHOD` has the smallest true error in this study. What cannot be a chest is refused here, with a reason.
-# The direction to the probe, which a tracker knows, tells front from back; without it the shape alone has to decide,
-# and the sample is refused: try it.
+# The direction to the probe, which a tracker knows, tells front from back; without it the shape alone has to decide.
 
 # %%
 pair = study.register_pair(ct, us, method=study.BEST_METHOD, seed=seed, front=FRONT, times=times)

@@ -251,7 +251,7 @@ def biomarker(wall: FrontWall, mask: Volume, frames: Mapping[str, Floats], size_
     look(top[1], "front", extent, "b  the three types", on_dark=True)
     for k, (what, frame) in enumerate(frames.items()):
         ax = figure.add_subplot(grid[1, k])
-        seen = np.round(np.asarray(frame) * 47) / 47
+        seen = np.round(np.asarray(frame) * 23) / 23  # few greys keep a PNG of speckle small
         ax.imshow(seen, cmap="gray", vmin=0, vmax=1, extent=(0, size_mm[0], size_mm[1], 0), interpolation="nearest")
         ax.set_xlabel("along the aperture (mm)", fontsize=8)
         ax.set_ylabel("depth (mm)", fontsize=8)

@@ -1,6 +1,6 @@
 """Tracked ultrasound (sec. II): calibrations, masks to cloud; the virtual sweep and the sizes of its errors."""
 
-from study.ultrasound.b_mode import b_mode_like, ct_frame, frame_below, frame_of
+from study.ultrasound.b_mode import b_mode_like, ct_frame, frame_below, frame_of, skin_depth_mm
 from study.ultrasound.cloud import SweepCloud, SweepReport, contour_points, sweep_cloud, thin_evenly, upper_contour
 from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.probe import Probe
@@ -35,6 +35,7 @@ __all__ = [
     "simulate_calibration_views",
     "simulate_latency_run",
     "simulate_sweep",
+    "skin_depth_mm",
     "sweep_cloud",
     "thin_evenly",
     "true_parts",

@@ -40,6 +40,20 @@ def ct_frame(
     return values.reshape(shape)
 
 
+def skin_depth_mm(volume: Volume, place_mm: Floats) -> float:
+    """How far (mm) the frontmost tissue lies in front of a place (3,) RAS+ mm.
+
+    Raises:
+        StudyError: no tissue in front of that place.
+    """
+    i, _, k = np.round(volume.to_index(np.reshape(place_mm, (1, 3)))[0]).astype(int)
+    inside = 0 <= i < volume.shape[0] and 0 <= k < volume.shape[2]
+    tissue = np.flatnonzero(volume.values[i, :, k] > _AIR_HU) if inside else np.empty(0)
+    if not len(tissue):
+        raise StudyError(f"{volume.name}: expected tissue in front of {place_mm} mm, got none; take a place in the CT")
+    return float(volume.to_mm([[i, tissue.max(), k]])[0, 1] - place_mm[1])
+
+
 def frame_below(volume: Volume, mask: Volume, place_mm: Floats, probe: Probe, rng: np.random.Generator) -> Floats:
     """A B-mode-like frame of a CT: the probe on the skin in front of a place, its aperture along the body.
 
@@ -53,12 +67,7 @@ def frame_below(volume: Volume, mask: Volume, place_mm: Floats, probe: Probe, rn
     Raises:
         StudyError: no tissue in front of that place.
     """
-    i, _, k = np.round(volume.to_index(np.reshape(place_mm, (1, 3)))[0]).astype(int)
-    inside = 0 <= i < volume.shape[0] and 0 <= k < volume.shape[2]
-    tissue = np.flatnonzero(volume.values[i, :, k] > _AIR_HU) if inside else np.empty(0)
-    if not len(tissue):
-        raise StudyError(f"{volume.name}: expected tissue in front of {place_mm} mm, got none; take a place in the CT")
-    skin = volume.to_mm([[i, tissue.max(), k]])[0, 1]
+    skin = place_mm[1] + skin_depth_mm(volume, place_mm)
     # x of the image runs to the feet, y to the back, so that the third axis runs to the patient's left.
     rotation = np.array([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
     T_ras_image = RigidTransform(rotation, np.array([place_mm[0], skin - 1.0, place_mm[2] + probe.aperture_mm / 2]))
@@ -103,7 +112,7 @@ def b_mode_like(hu: Floats, cartilage: Bools, pixel_mm: float, rng: np.random.Ge
     )  # of a wave: a real and an imaginary part
     grain = np.hypot(*speckle) / np.hypot(*speckle).mean()
     # Bone and air pass almost nothing; soft tissue loses some on the way.
-    loss = np.where(bone, 1.1, np.where(hu < _AIR_HU, 0.9, 0.012)) * pixel_mm
+    loss = np.where(bone, 4.0, np.where(hu < _AIR_HU, 0.9, 0.012)) * pixel_mm
     passed = np.exp(-np.cumsum(loss, axis=0))
     echo = passed * (reflected * (0.6 + 0.4 * grain) + own * grain)
     echo = ndimage.gaussian_filter(echo, (0.1 / pixel_mm, 0.2 / pixel_mm))
