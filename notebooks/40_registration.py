@@ -19,6 +19,7 @@ seed = 0
 import numpy as np
 import pandas as pd
 from IPython.display import Markdown
+from tqdm import tqdm
 
 from study import METHODS, datasets, evaluation, figures, methods, params, pipeline, results
 
@@ -52,7 +53,7 @@ pd.DataFrame({"points": [len(ct), len(us)]}, index=[f"CT of {source}", f"US of {
 # %%
 answers = {
     name: pipeline.register_aligned(pair.alignment, method, data.rng(f"{pair.name}/{name}"))
-    for name, method in METHODS.items()
+    for name, method in tqdm(METHODS.items(), "methods")
 }
 judged = {name: evaluation.Judgement(pair, result, data.params.radius_mm) for name, result in answers.items()}
 pd.DataFrame(

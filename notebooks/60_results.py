@@ -30,7 +30,7 @@ GRAPH, TRUTH = evaluation.GRAPH, evaluation.TRUTH
 # table says so. `as now` means that code, parameters and methods of the run are those of this checkout.
 
 # %%
-batch.open_run(dataset, profile, seed)
+batch.open_run(dataset, profile, seed, show_progress=True)
 found = {name: results.newest(name, profile, seed) for name in dict.fromkeys((dataset, *datasets.reported()))}
 runs = {name: run for name, run in found.items() if run is not None}
 about = pd.DataFrame({name: run.overview() for name, run in runs.items()}).drop(

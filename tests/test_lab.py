@@ -36,7 +36,8 @@ def git(folder: Path, *words: str) -> str:
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The committed pairs and one small one, in a repository of their own."""
     folder = tmp_path_factory.mktemp("checkout")
-    shutil.copy(ROOT / "pyproject.toml", folder)
+    for name in ("pyproject.toml", ".gitignore"):
+        shutil.copy(ROOT / name, folder)
     pairs = folder / "notebooks"
     pairs.mkdir()
     for path in [*ROOT.glob("notebooks/[0-9]*.py"), *ROOT.glob("notebooks/[0-9]*.ipynb")]:
@@ -98,7 +99,7 @@ def test_opening_and_saving_a_committed_pair_changes_nothing(ask: Ask, checkout:
     for path in pairs:
         place = f"notebooks/{path.name}"
         saved(ask, place, ask("GET", f"api/contents/{place}?content=1&type=notebook")["content"])
-        assert git(checkout, "status", "--porcelain") == "", f"{path.name}: {git(checkout, 'diff')[:2000]}"
+        assert git(checkout, "status", "--porcelain") == "", f"{path.name}: {git(checkout, 'diff')[:3000]}"
 
 
 def test_open_run_all_save_changes_outputs_only(ask: Ask, checkout: Path) -> None:

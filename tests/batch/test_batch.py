@@ -309,6 +309,24 @@ def test_a_run_is_opened_made_or_made_again(
     assert "the data set" in str(run.why_stale("planted", run_parameters(people()), 0))
 
 
+def test_a_run_of_chosen_methods_has_as_many_processes_as_the_notebooks_were_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    seen = []
+    monkeypatch.setattr(runs, "find_profile", lambda _: SMALL)
+    monkeypatch.setattr(runs, "run_folder", lambda *given: tmp_path / "+".join(given[-1]))
+    monkeypatch.setattr(runs, "Workers", lambda n_jobs, show: seen.append(n_jobs) or Workers(1, show))
+    monkeypatch.setenv(runs.JOBS, "7")
+    assert open_run("phantom", "quick", 0, "coarse, icp").methods == ["coarse", "icp", "truth"]
+    assert (tmp_path / "coarse+icp" / "metrics.csv").is_file()
+    assert seen == [7]
+    with pytest.raises(StudyError, match="got 'ipc'"):
+        open_run("phantom", "quick", 0, "icp,ipc")
+    monkeypatch.setenv(runs.JOBS, "many")
+    with pytest.raises(StudyError, match="STUDY_JOBS: expected a number of processes, got 'many'"):
+        open_run("phantom", "quick", 0, "icp")
+
+
 def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PhantomDataset, "anatomy", failing("ct1", AssertionError("nothing may be read")))
     with pytest.raises(StudyError, match=r"among coarse, icp, .*got 'ipc'"):

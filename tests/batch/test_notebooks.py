@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 
 from study.batch import notebooks
 from study.batch.notebooks import Task, plan, run_notebooks
-from study.batch.papermills import KERNELSPEC, find_notebooks, tidied
+from study.batch.papermills import FILTERS, KERNELSPEC, find_notebooks, tidied
 from study.cli import main
 from study.datasets import reported
 from study.errors import StudyError
@@ -224,7 +225,9 @@ def test_what_the_repository_keeps_is_text_and_outputs(folder: Path) -> None:
     notebook.metadata["papermill"] = {"duration": 1.0}
     kept = tidied(notebook)
     assert [cell.source for cell in kept.cells] == ["# One and one?", "seed = 1", "print(seed + 1)"]
-    assert kept.metadata == {"kernelspec": KERNELSPEC, "language_info": {"name": "python"}}
+    assert kept.metadata == {"jupytext": FILTERS, "kernelspec": KERNELSPEC, "language_info": {"name": "python"}}
+    told = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["jupytext"]
+    assert {name: told[name] for name in FILTERS} == FILTERS
     assert [cell.metadata for cell in kept.cells] == [{}, {"tags": ["parameters"]}, {}]
     assert [output.output_type for output in last.outputs] == ["execute_result"]
     assert (last.execution_count, last.outputs[0].execution_count) == (2, 2)

@@ -21,6 +21,8 @@ from study.files.atomic import replacing
 
 KERNEL = "python3"
 KERNELSPEC = {"name": KERNEL, "display_name": "Python 3 (ipykernel)", "language": "python"}  # as JupyterLab writes it
+# What pyproject.toml says to jupytext, whose half in JupyterLab notes it in every notebook that it saves.
+FILTERS = {"cell_metadata_filter": "tags,-all", "notebook_metadata_filter": "-all"}
 INJECTED = "injected-parameters"  # papermill's tag of the cell that it adds
 
 
@@ -204,7 +206,7 @@ def tidied(notebook: Any) -> Any:
     and says nothing; cells count from 1 as without papermill's.
     """
     language = {"language_info": notebook.metadata.get("language_info", {"name": "python"})}
-    notebook.metadata = nbformat.from_dict({"kernelspec": KERNELSPEC, **language})
+    notebook.metadata = nbformat.from_dict({"jupytext": FILTERS, "kernelspec": KERNELSPEC, **language})
     notebook.cells = [cell for cell in notebook.cells if INJECTED not in cell.metadata.get("tags", [])]
     without_stderr(notebook)
     n_executed = 0

@@ -66,7 +66,7 @@ def notebooks(
     for one in failed:
         click.echo(f"study: {one.name}: {one.fault}; kept as far as it came: {one.path}", err=True)
     n_kept = sum(one.kept for one in ended)
-    click.echo(f"{len(ended)} notebooks, {n_kept} of them finished before, {len(failed)} failed: {out / INDEX}")
+    click.echo(f"notebooks: {len(ended)}, finished before: {n_kept}, failed: {len(failed)}; {out / INDEX}")
     click.get_current_context().exit(1 if failed else 0)
 
 

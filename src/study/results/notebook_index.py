@@ -28,7 +28,7 @@ th, td { text-align: left; padding: .3em .8em .3em 0; border-bottom: 1px solid #
 .failed { color: #b2182b; font-weight: bold }
 </style>
 <h1>Executed notebooks</h1>
-<p>{{ rows | length }} notebooks, {{ n_failed }} failed, {{ "%.0f" | format(seconds) }} s of execution in all.</p>
+<p>Executed: {{ rows | length }}; failed: {{ n_failed }}; {{ "%.0f" | format(seconds) }} s in all. Times are UTC.</p>
 <div><table>
 <thead><tr><th>Notebook<th>Parameters<th class="number">Seconds<th>Started<th>State</tr></thead>
 <tbody>
