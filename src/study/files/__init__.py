@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from study.files.calibration import read_calibration, write_calibration
     from study.files.clouds import read_ply, read_timed_ply, read_waypoints, write_ply, write_registration
     from study.files.landmarks import read_landmarks
     from study.files.plus import read_plus
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from study.files.volumes import read_labels, read_masks, read_volume, write_volume
 
 __all__ = [
+    "read_calibration",
     "read_folder",
     "read_labels",
     "read_landmarks",
@@ -21,6 +23,7 @@ __all__ = [
     "read_timed_ply",
     "read_volume",
     "read_waypoints",
+    "write_calibration",
     "write_folder",
     "write_plus",
     "write_ply",
@@ -29,6 +32,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "read_calibration": "calibration",
     "read_folder": "sweep_folder",
     "read_labels": "volumes",
     "read_landmarks": "landmarks",
@@ -38,6 +42,7 @@ _HOMES = {
     "read_timed_ply": "clouds",
     "read_volume": "volumes",
     "read_waypoints": "clouds",
+    "write_calibration": "calibration",
     "write_folder": "sweep_folder",
     "write_plus": "plus_write",
     "write_ply": "clouds",
