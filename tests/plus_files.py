@@ -1,5 +1,7 @@
 """Small PLUS files as another program writes them."""
 
+import gzip
+
 import numpy as np
 
 PIXELS = np.arange(12, dtype=np.uint8)
@@ -33,4 +35,34 @@ def plus_nrrd(path, *, drop=(), pixels=None, pairs=(), **changes):
     lines += [f"{key}: {value}" for key, value in head.items() if key not in drop]
     lines += [f"{key}:={value}" for key, value in fields.items() if key not in drop]
     path.write_bytes("\n".join([*lines, "", ""]).encode() + (PIXELS.tobytes() if pixels is None else pixels))
+    return path
+
+
+def plus_recording(path, sweep, *, matrix_of_config=True):
+    """A sweep's B-mode as PLUS leaves it: an NRRD of frames with their poses, the configuration beside it."""
+    poses, _, tracked = sweep.frame_poses()
+    f, h, w = sweep.images.shape
+    lines = [
+        "NRRD0004", "type: uint8", "dimension: 3", f"sizes: {w} {h} {f}", "kinds: domain domain list",
+        "space dimension: 2", "space directions: (1,0) (0,1) none", "space origin: (0,0)", "endian: little",
+        "encoding: gz", "ultrasound image orientation:=MF",
+    ]  # fmt: skip
+    for i in range(f):
+        pose = " ".join(repr(float(value)) for value in poses[i].ravel())
+        lines += [
+            f"Seq_Frame{i:04d}_ProbeToTrackerTransform:={pose}",
+            f"Seq_Frame{i:04d}_ProbeToTrackerTransformStatus:={'OK' if tracked[i] else 'INVALID'}",
+            f"Seq_Frame{i:04d}_Timestamp:={float(sweep.frame_times_s[i])!r}",
+            f"Seq_Frame{i:04d}_Status:=OK",
+        ]
+    path.write_bytes("\n".join([*lines, "", ""]).encode() + gzip.compress(sweep.images.tobytes()))
+    if matrix_of_config:
+        scale = np.diag([*sweep.pixel_spacing_mm, sweep.pixel_spacing_mm[0], 1.0])
+        matrix = " ".join(repr(float(value)) for value in (sweep.T_probe_image.matrix @ scale).ravel())
+        path.with_name(path.name.partition(".")[0] + "_config.xml").write_text(
+            '<PlusConfiguration version="2.9"><CoordinateDefinitions>'
+            f'<Transform From="Image" To="Probe" Matrix="{matrix}" Error="0.5"/>'
+            "</CoordinateDefinitions></PlusConfiguration>",
+            encoding="utf-8",
+        )
     return path

@@ -56,7 +56,7 @@ class BoneFinder:
     apart_mm: float = 6.0
     shortest_mm: float = 4.0
     line_mm: float = 1.0
-    min_quality: float = 0.12
+    min_quality: float = 0.16
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def find_bone_surface(
     quality = np.full(len(images), np.nan)
     for frame in progress(range(len(images))):
         likelihood = filters.likelihood(images[frame])
-        path = _strongest_path(likelihood, finder, filters.spacing_mm)
+        path = _trusted(_strongest_path(likelihood, finder, filters.spacing_mm), likelihood, finder, filters.spacing_mm)
         found = np.flatnonzero(path >= 0)
         if len(found):
             quality[frame] = likelihood[path[found], found].mean()
@@ -240,7 +240,7 @@ def _strongest_path(likelihood: Floats, finder: BoneFinder, spacing_mm: tuple[fl
     """Row (w,) of the strongest smooth path in each column, -1 where there is none (dynamic programming)."""
     h, w = likelihood.shape
     sx, sy = spacing_mm
-    reach = max(1, int(np.ceil(1.7 * sx / sy)))  # 60 degrees
+    reach = _reach(spacing_mm)
     moves = np.arange(-reach, reach + 1)
     cost = finder.slope * (moves * sy / sx) ** 2 * sx
     gain = (likelihood - finder.least) * sx  # by the mm, so that a pixel's size does not matter
@@ -278,7 +278,7 @@ def _strongest_path(likelihood: Floats, finder: BoneFinder, spacing_mm: tuple[fl
             row = int(ended[column]) if column > 0 else -1
             continue
         row = row + int(moves[step])
-    return _trusted(path, likelihood, finder, spacing_mm, reach)
+    return path
 
 
 def _pieces(path: Ints, reach: int) -> list[tuple[int, int]]:
@@ -290,10 +290,17 @@ def _pieces(path: Ints, reach: int) -> list[tuple[int, int]]:
     return list(zip(starts.tolist(), stops.tolist(), strict=True))
 
 
-def _trusted(path: Ints, likelihood: Floats, finder: BoneFinder, spacing_mm: tuple[float, float], reach: int) -> Ints:
+def _reach(spacing_mm: tuple[float, float]) -> int:
+    """Rows that a path may go from one column to the next: 60 degrees."""
+    return max(1, int(np.ceil(1.7 * spacing_mm[0] / spacing_mm[1])))
+
+
+def _trusted(path: Ints, likelihood: Floats, finder: BoneFinder, spacing_mm: tuple[float, float]) -> Ints:
     """A path without the pieces that are short, much less likely than its best, or far from that in depth."""
     sx, sy = spacing_mm
-    pieces = [(start, stop) for start, stop in _pieces(path, reach) if (stop - start) * sx >= finder.shortest_mm]
+    pieces = [
+        (start, stop) for start, stop in _pieces(path, _reach(spacing_mm)) if (stop - start) * sx >= finder.shortest_mm
+    ]
     sums = [float(likelihood[path[start:stop], np.arange(start, stop)].sum()) for start, stop in pieces]
     kept = np.full_like(path, -1)
     if not pieces:
