@@ -51,9 +51,8 @@ check: $(STAMP)  ## ruff, types, import layers, notebook pairing
 notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
 	$(BIN)/python tools/notebooks.py write --jobs $(JOBS)
 
-reference: $(STAMP)  ## renew results/reference and results/evidence from results/runs (a CHANGELOG entry says why)
-	for d in $$($(BIN)/study datasets --reported); do \
-	  rm -rf results/reference/$$d && cp -r $(RUNS)/$$d results/reference/$$d; done
+reference: study  ## run the study, renew results/reference and results/evidence, draft the CHANGELOG rows
+	$(BIN)/python tools/reference.py --runs $(RUNS)
 	for part in robustness sensitivity people; do if [ -d $(EVIDENCE)/$$part ]; then \
 	  mkdir -p results/evidence && rm -rf results/evidence/$$part && cp -r $(EVIDENCE)/$$part results/evidence/$$part; \
 	  fi; done

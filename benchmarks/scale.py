@@ -1,10 +1,10 @@
 """What a registration costs: by method, by stage, by the number of points, frames and voxels. Printed, and stored.
 
-    python benchmarks/scale.py [--most 1000000] [--out results/runs/bench]
+    python benchmarks/scale.py [--most 1000000] [--only methods] [--out results/runs/bench]
 
 Times are processor time of one thread in one run, after a first call that compiles; ratios are what carries over to
-another machine. Memory is what one registration adds to the process, in a process of its own for each size. Tables go
-to ``methods.csv``, ``stages.csv``, ``points.csv``, ``frames.csv`` and ``voxels.csv``.
+another machine. Each number of points has a process of its own, whose memory is the largest it ever held, imports
+included. Tables go to ``methods.csv``, ``stages.csv``, ``points.csv``, ``frames.csv`` and ``voxels.csv``.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import argparse
 import resource
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from multiprocessing.pool import Pool
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +41,16 @@ from study.ultrasound.virtual_sweep import simulate_sweep
 
 CT_POINTS, US_POINTS = 9000, 6600
 PAPERS = "skeleton_graph"
+SIZES = (1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000)  # points of each cloud
+NOISE_MM = 0.5
+LIMIT_S = 600  # of the clock, for one size
 
 
-def clouds(ct_points: int = CT_POINTS, us_points: int = US_POINTS) -> tuple[Floats, Floats]:
-    """A synthetic pair of that many points, mm."""
+def clouds() -> tuple[Floats, Floats]:
+    """A synthetic pair, CT and US, (9000, 3) and (6600, 3) mm."""
     person, patient = (phantom.draw_subject(name, PHANTOM_SEED) for name in ("ct1", "patient"))
-    ct = phantom.reference_cloud(person, ct_points, np.random.default_rng(0)).points
-    return ct, phantom.anterior_cloud(patient, us_points, 0.5, 0, np.random.default_rng(1)).points
+    ct = phantom.reference_cloud(person, CT_POINTS, np.random.default_rng(0)).points
+    return ct, phantom.anterior_cloud(patient, US_POINTS, 0.5, 0, np.random.default_rng(1)).points
 
 
 def by_method() -> pd.DataFrame:
@@ -81,39 +84,45 @@ def by_stage() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def of_points(n: int, method: str) -> dict[str, Any]:
-    """One registration of ``n`` and ``n`` points, in a process that has run a small one before."""
-    register_pair(*clouds(), method)
-    ct, us = clouds(n, n)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def dense(cloud: Floats, n: int, rng: np.random.Generator) -> Floats:
+    """A cloud seen again and again, ``n`` points (n, 3) mm in all, each off by the noise of a segmentation.
+
+    To draw a million points on the phantom's own surface takes minutes, which would tell nothing of the registration.
+    """
+    points: Floats = cloud[rng.integers(len(cloud), size=n)] + rng.normal(scale=NOISE_MM, size=(n, 3))
+    return points
+
+
+def of_points(ct: Floats, us: Floats, n: int, method: str) -> dict[str, Any]:
+    """One registration of ``n`` and ``n`` points, after one of the clouds (., 3) mm that they are made from."""
     with threadpool_limits(1):
-        start = time.process_time()
         register_pair(ct, us, method)
+        many = [dense(cloud, n, np.random.default_rng(0)) for cloud in (ct, us)]
+        start = time.process_time()
+        register_pair(*many, method)
         seconds = time.process_time() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {
-        "method": method,
-        "points": n,
-        "seconds": seconds,
-        "added_mb": (peak - before) / 1024,
-        "peak_mb": peak / 1024,
-    }
+    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return {"method": method, "points": n, "seconds": seconds, "peak_gb": peak_gb}
 
 
 def alone(measure: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
-    """What a function returns from a process that has done nothing before."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(measure, *arguments).result()
+    """What a function returns from a process that has done nothing before.
+
+    Raises:
+        TimeoutError: it took longer than ``LIMIT_S``; the process is ended.
+    """
+    with Pool(1, context=get_context("spawn")) as pool:
+        return pool.apply_async(measure, arguments).get(LIMIT_S)
 
 
 def by_points(most: int) -> pd.DataFrame:
-    """Cost against the number of points, each in a process of its own; ``slope`` of log time against log points."""
-    sizes = [n for n in (1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if 1000 < n <= most]
-    rows = [alone(of_points, n, method) for method in (PAPERS, BEST_METHOD) for n in sizes]
-    table = pd.DataFrame(rows)
-    logs = np.log(table[["points", "seconds"]])
-    slope = logs.groupby(table["method"]).diff()
-    return table.assign(slope=slope["seconds"] / slope["points"])
+    """Cost against the number of points; ``slope`` of log time against log points, from row to row."""
+    sizes = [n for n in SIZES if n <= most]
+    pair, tables = clouds(), []
+    for method in (PAPERS, BEST_METHOD):
+        rows = [alone(of_points, *pair, n, method) for n in sizes]
+        tables.append(with_slope(pd.DataFrame(rows), "points"))
+    return pd.concat(tables)
 
 
 def by_frames() -> pd.DataFrame:
@@ -161,9 +170,16 @@ def with_slope(table: pd.DataFrame, size: str) -> pd.DataFrame:
     return table.assign(slope=logs["seconds"] / logs[size])
 
 
+def readable(table: pd.DataFrame) -> str:
+    """The table as it is printed: counts in groups of three digits, seconds and ratios with two decimals."""
+    counts = {name: "{:,}".format for name in ("points", "frames", "voxels")}
+    return table.to_string(index=False, na_rep="", float_format="{:.2f}".format, formatters=counts)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--most", type=int, default=1_000_000, help="points of the largest clouds")
+    parser.add_argument("--only", action="append", help="a table's name; again for another")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "results" / "runs" / "bench")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -176,8 +192,10 @@ def main() -> None:
     }
     with threadpool_limits(1):
         for name, measure in tables.items():
+            if options.only and name not in options.only:
+                continue
             table = measure()
-            print(f"\n{name}\n{table.round(3).to_string(index=False)}", flush=True)
+            print(f"\n{name}\n{readable(table)}", flush=True)
             write_text(options.out / f"{name}.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.4f"))
 
 

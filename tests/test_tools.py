@@ -209,7 +209,17 @@ def test_both_surfaces_are_tuned_on_one_grid_and_every_row_is_recorded(tune: Mod
 def test_the_field_method_is_tuned_on_people_of_three_kinds_and_every_row_is_recorded(tune: ModuleType) -> None:
     recorded = pd.read_csv(ROOT / "results" / "tuning" / "gaussian_process.csv")
     assert sorted(recorded["setting"]) == list(range(len(list(tune.grid("gaussian_process")))))
-    assert min(len(tune.PAIRS), len(tune.FULL_SPREAD), len(tune.PLANTED)) >= 4
+    assert min(len(tune.PHANTOMS), len(tune.FULL_SPREAD), len(tune.PLANTED)) >= 4
+    assert (recorded["pairs"] == len(tune.PHANTOMS) + len(tune.FULL_SPREAD) + len(tune.PLANTED)).all()
+
+
+@pytest.mark.parametrize("name", ["icp", "cpd_whole", "bcpd", "skeleton_graph_repaired"])
+def test_the_best_rows_of_a_large_grid_ran_on_more_people_of_three_kinds(tune: ModuleType, name: str) -> None:
+    recorded = pd.read_csv(ROOT / "results" / "tuning" / f"{name}.csv")
+    assert min(map(len, tune.FEWER)) >= 2
+    assert set(recorded["pairs"]) == {tune.FIRST, sum(map(len, tune.FEWER))}
+    assert recorded["pairs"].to_list() == sorted(recorded["pairs"], reverse=True)
+    assert (recorded["pairs"] > tune.FIRST).sum() == tune.FINALISTS
 
 
 @pytest.mark.parametrize("name", ["bcpd", "skeleton_graph_repaired"])
@@ -228,11 +238,12 @@ def test_a_grid_runs_on_the_surface_that_its_table_is_named_after(
         raise tune.StudyError("enough")
 
     monkeypatch.setattr(tune, "register_aligned", seen)
-    monkeypatch.setattr(tune, "development_pair", lambda name, _: SimpleNamespace(source=name, alignment=None))
+    monkeypatch.setattr(tune, "development_pair", lambda name, *_: SimpleNamespace(source=name, alignment=None))
+    monkeypatch.setattr(tune, "planted_pair", lambda name, _: SimpleNamespace(source=name, alignment=None))
     monkeypatch.setattr(tune, "grid", lambda _: [tune.Icp()])
-    monkeypatch.setattr(tune, "summarise", lambda rows: rows)
+    monkeypatch.setattr(tune, "summarise", lambda rows: rows)  # as many finalists as rows
     for table in ("icp", "icp_whole", "cpd", "cpd_whole"):
         monkeypatch.setattr(sys, "argv", ["tune.py", table, "--out", str(tmp_path)])
         tune.main()
-        assert len(pd.read_csv(tmp_path / f"{table}.csv")) == len(tune.PAIRS)
+        assert len(pd.read_csv(tmp_path / f"{table}.csv")) == sum(map(len, tune.FEWER))
     assert surfaces == {"icp": "visible", "icp_whole": "whole", "cpd": "visible", "cpd_whole": "whole"}

@@ -79,7 +79,7 @@ def test_wheel_carries_every_module_the_shipped_files_and_no_tests(wheel: Path) 
     shipped = [manifest, *(ROOT / "annotations").glob("*.yaml"), *(ROOT / "results" / "paper").glob("*.csv")]
     modules = [path.relative_to(ROOT / "src").as_posix() for path in (ROOT / "src").rglob("*.py")]
     assert len(shipped) >= 6
-    assert "study/cli.py" in modules
+    assert "study/cli/__init__.py" in modules
     assert wheel.name.startswith(f"{DISTRIBUTION}-{__version__}-py3-")
     with ZipFile(wheel) as archive:
         names = set(archive.namelist())

@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import Any
 
+from study.offline import is_offline, watch_connections
+
 __version__ = "0.3.0"
 
 # Found on first use: importing the methods costs seconds, which `study data list` need not pay.
@@ -17,6 +19,9 @@ _HOMES = {
     "sweep_cloud": "study.ultrasound.cloud",
     "transfer": "study.registration",
 }
+
+if is_offline():
+    watch_connections()
 
 __all__ = [
     "BEST_METHOD",

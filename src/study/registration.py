@@ -18,6 +18,7 @@ from study.types import Floats, PointCloud, RigidTransform, as_points
 MIN_SUPPORT = 3  # points that hold a rigid motion
 MIN_WIDTH_MM = 1e-6  # second singular value of points that lie on a line but for rounding
 REACH_MM = 50.0  # from the CT points, beyond which a field is a guess
+CARRIED_AT_ONCE = 20_000  # points; each takes a kilobyte while its rigid motion is fitted
 MIN_PATH_MM = 1.0  # extent of a path; one in metres is a fraction of a millimetre across
 
 
@@ -117,10 +118,13 @@ def transfer(source: ArrayLike, warped: ArrayLike, waypoints: ArrayLike, *, radi
 
 def carry(points: Floats, source: Floats, warped: Floats, neighbours: int) -> Floats:
     """Move each of ``points`` (k, 3) by the rigid motion of its nearest ``source`` (n, 3) to ``warped`` (n, 3)."""
-    _, index = KDTree(source).query(points, k=neighbours)
-    weights = np.full(index.shape, 1 / neighbours)
-    rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
-    carried: Floats = np.einsum("nij,nj->ni", rotations, points) + translations
+    tree, carried = KDTree(source), np.empty_like(points)
+    for start in range(0, len(points), CARRIED_AT_ONCE):
+        rows = slice(start, start + CARRIED_AT_ONCE)
+        _, index = tree.query(points[rows], k=neighbours)
+        weights = np.full(index.shape, 1 / neighbours)
+        rotations, translations = fit_rigid_batch(source[index], warped[index], weights)
+        carried[rows] = np.einsum("nij,nj->ni", rotations, points[rows]) + translations
     return carried
 
 

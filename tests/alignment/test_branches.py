@@ -1,9 +1,11 @@
 """Branches of a planted drawing, and of the phantom seen from the front."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
-from study.alignment.branches import find_branches, sternum_edge_mm
+from study.alignment.branches import MAX_OFFSET_MM, _facing, find_branches, sternum_edge_mm
 from study.errors import StudyError
 
 ROWS = (-38.0, -14.0, 12.0, 38.0)
@@ -93,3 +95,15 @@ def test_the_answer_does_not_depend_on_the_order_of_the_points():
     points, _ = drawing()
     order = np.random.default_rng(2).permutation(len(points))
     assert np.array_equal(find_branches(points[order], 90.0).branch, find_branches(points, 90.0).branch[order])
+
+
+@pytest.mark.parametrize("scale_mm", [2.0, 8.0, 30.0])  # at most: the first pair fits, a later one, none
+def test_the_nearest_pair_of_bands_that_face_each_other_is_chosen(scale_mm):
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        left, right = (list(rng.normal(scale=scale_mm, size=(rng.integers(1, 6), 4, 2))) for _ in range(2))
+        order = sorted(product(range(len(left)), range(len(right))), key=sum)
+        pairs = [(left[i], right[j]) for i, j in order]
+        offsets = [np.abs(one[:, 1] - other[:, 1]).max() for one, other in pairs]
+        chosen = next((k for k, mm in enumerate(offsets) if mm <= MAX_OFFSET_MM), int(np.argmin(offsets)))
+        assert np.array_equal(_facing(iter(left), iter(right)), np.concatenate(pairs[chosen]))

@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.signal import correlate
 
+from study.alignment import sternum
 from study.alignment.sternum import SternumParams, feature_plane, rectangle_mask, sternum_candidates, symmetry_axis
 from study.errors import StudyError
+from study.geometry.points import close_gaps, pixelise, sample_spacing_mm
 from study.types import PointCloud, RigidTransform
 
 
@@ -78,6 +82,51 @@ def test_the_symmetry_axis_of_a_planted_symmetric_drawing(angle_deg, shift_mm):
     angle, shift = symmetry_axis(turned(whole, angle_deg))
     assert angle == pytest.approx(angle_deg, abs=3.0)  # bars without texture leave it that much play
     assert shift == pytest.approx(shift_mm, abs=2.0)  # one pixel
+
+
+@pytest.mark.parametrize("near", [None, np.array([10.0, 25.0])])
+def test_the_best_place_is_eq_1_as_written(near):
+    points = drawing(np.random.default_rng(3)) + np.array([10.0, 20.0])
+    params, scale_mm = SternumParams(), 5.0
+    pad = int(np.ceil(np.hypot(30, 90) / 2 / scale_mm)) + 1
+    image, _, origin = pixelise(points, scale_mm, pad)
+    image = close_gaps(image, 1).astype(np.float64)
+    where = np.indices(image.shape) * scale_mm + origin[:, None, None]
+    for fit in sternum._best_place(points, scale_mm, np.arange(-90.0, 90.0, 30.0), near, params, 5.0):
+        mask = rectangle_mask(30, 90, scale_mm, fit.angle_deg)
+        covered = correlate(image, mask, mode="same", method="direct") / mask.sum()
+        if near is not None:
+            covered[np.hypot(*(where - near[:, None, None])) > 12.5] = 0.0
+        assert fit.overlap == pytest.approx(covered.max(), abs=1e-12)
+        best = np.argwhere(covered >= covered.max() - 1e-6)
+        assert fit.centre == pytest.approx(best.mean(axis=0) * scale_mm + origin, abs=1e-9)
+
+
+def mirrored_literally(points):
+    """The best of all turns and shifts, each mirrored view laid over the view; its angle and shift."""
+    image, _, origin = pixelise(points, 2.0, pad=4)
+    x, y = (np.argwhere(close_gaps(image, round(sample_spacing_mm(points)))) * 2.0 + origin).T
+    best, answer = -1.0, (0.0, 0.0)
+    for step, around in ((2.0, 40.0), (0.5, 2.0)):
+        centre = answer[0]
+        for angle in np.arange(centre - around, centre + around + step / 2, step):
+            c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+            across, along = c * x + s * y, c * y - s * x
+            near = np.abs(across) < 55.0
+            bins = (np.arange(-63.0, 64.0, 2.0), np.arange(-200.0, 201.0, 2.0))
+            view = gaussian_filter(np.minimum(np.histogram2d(across[near], along[near], bins)[0], 1.0), 2.0)
+            for shift in range(-8, 9):
+                score = float((view * np.roll(view[::-1], shift, axis=0)).sum())
+                if score > best:
+                    best, answer = score, (float(angle), float(shift))
+    return answer
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_symmetry_axis_is_that_of_mirrored_views_laid_over_each_other(seed):
+    rng = np.random.default_rng(seed)
+    points = turned(drawing(rng)[rng.random(5000) < 0.5], rng.uniform(-20, 20)) + rng.uniform(-8, 8, 2)
+    assert symmetry_axis(points) == mirrored_literally(points)
 
 
 def test_the_feature_plane_is_a_proper_motion_onto_the_wall(ct_clouds):

@@ -90,7 +90,8 @@ def test_another_seed_gives_other_numbers(first: Path) -> None:
 
 def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
     assert {path.name for path in first.iterdir()} == {
-        "metrics.csv", "timings.csv", "provenance.json", "hd_table.csv", "hd_table.md", "hd_table.tex"
+        "metrics.csv", "timings.csv", "provenance.json", "hd_table.csv", "hd_table.md", "hd_table.tex",
+        "parameters.json", "manifest.yaml", "environment.lock", "ro-crate-metadata.json",
     }  # fmt: skip
     assert " n " in (first / "hd_table.md").read_text(encoding="utf-8")
     timings = pd.read_csv(first / "timings.csv")

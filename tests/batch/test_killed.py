@@ -45,7 +45,7 @@ def ask() -> Iterator[Callable[[str], list[str]]]:
 
 def content(folder: Path) -> dict[str, bytes]:
     """What must not depend on how often a run was stopped: all but times."""
-    timed = ("timings.csv", "provenance.json")
+    timed = ("timings.csv", "provenance.json", "ro-crate-metadata.json")
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in timed}
 
 

@@ -122,6 +122,18 @@ def test_the_bounds_are_the_tables_and_cover_people_that_they_were_not_chosen_on
     assert table["covers_checked"].between(0.90, 0.98).all()
 
 
+def test_the_bounds_cover_more_people_of_every_kind():
+    table = pd.read_csv(Path(__file__).parents[2] / "results" / "tuning" / "bounds_by_kind.csv")
+    assert table.groupby("times")["bound_mm"].unique().map(list).to_dict() == {
+        True: [BOUND_MM],
+        False: [BOUND_UNTIMED_MM],
+    }
+    everyone = table[table["kind"] == "all"]
+    assert (everyone["patients"] >= 24).all()
+    assert everyone["covers"].between(0.90, 0.98).all()
+    assert (table["covers"] >= 0.90).all()
+
+
 def bent(cloud: PointCloud) -> PointCloud:
     """A cloud under a smooth deformation of its chest, 4 mm on average."""
     T = chest_frame(cloud).T_cloud_chest

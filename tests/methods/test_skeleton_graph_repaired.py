@@ -33,8 +33,8 @@ def pair(alignment):
 
 
 def test_it_is_registered_on_the_visible_surface_as_tuned():
-    assert METHODS["skeleton_graph_repaired"] == VisibleSurface(SkeletonGraphRepaired())
-    check_tuned(SkeletonGraphRepaired())
+    assert METHODS["skeleton_graph_repaired"] == VisibleSurface(SkeletonGraphRepaired.tuned())
+    check_tuned(SkeletonGraphRepaired.tuned())
 
 
 @pytest.mark.parametrize("every", [True, False])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from study import registration
 from study.alignment.chest import align
 from study.alignment.frame import chest_frame
 from study.errors import StudyError
@@ -27,6 +28,14 @@ def test_hidden_points_follow_a_rigid_motion_exactly():
     source, hidden = rng.normal(scale=20.0, size=(300, 3)), rng.normal(scale=20.0, size=(40, 3))
     motion = RigidTransform.random(rng)
     np.testing.assert_allclose(carry(hidden, source, motion.apply(source), 12), motion.apply(hidden), atol=1e-9)
+
+
+def test_points_carried_in_pieces_are_those_carried_at_once(monkeypatch):
+    rng = np.random.default_rng(2)
+    source, warped, hidden = (rng.normal(scale=20.0, size=(n, 3)) for n in (300, 300, 45))
+    at_once = carry(hidden, source, warped, 8)
+    monkeypatch.setattr(registration, "CARRIED_AT_ONCE", 20)
+    assert np.array_equal(carry(hidden, source, warped, 8), at_once)
 
 
 def test_a_rigid_method_stays_rigid_on_every_point(ct_clouds, us_cloud):

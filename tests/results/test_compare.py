@@ -24,7 +24,7 @@ def test_a_run_agrees_with_itself_and_with_small_differences(run):
         comparison = compare(run("reference", rows), run(name, other))
         assert comparison.n_compared == len(rows)
         assert (comparison.agrees, comparison.exit_code) == (True, 0)
-        assert f"compared {len(rows)} rows of 1 file(s)" in comparison.report()
+        assert f"compared {len(rows)} rows" in comparison.report()
 
 
 def test_the_largest_difference_is_listed_first(run):
@@ -61,9 +61,9 @@ def test_a_changed_status_differs(run):
 def test_what_cannot_be_compared_is_an_error(run, tmp_path):
     good = run("good", some_rows())
     (tmp_path / "bare").mkdir()
-    with pytest.raises(StudyError, match=r"expected metrics\.csv in"):
+    with pytest.raises(StudyError, match=r"expected .*bare/metrics\.csv, got no such file"):
         compare(tmp_path / "bare", good)
-    with pytest.raises(StudyError, match="only in"):
+    with pytest.raises(StudyError, match=r"expected .*nowhere/metrics\.csv, got no such file"):
         compare(good, tmp_path / "nowhere")
     empty = run("empty", some_rows())
     (empty / "metrics.csv").write_text("")
@@ -74,17 +74,6 @@ def test_what_cannot_be_compared_is_an_error(run, tmp_path):
     (empty / "metrics.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(StudyError, match="UTF-8"):
         compare(good, empty)
-
-
-def test_folders_of_datasets_are_compared_together(run, tmp_path):
-    for name in ("reference", "candidate"):
-        run(f"{name}/phantom", some_rows())
-        run(f"{name}/open", some_rows(1, "open"))
-    comparison = compare(tmp_path / "reference", tmp_path / "candidate")
-    assert (comparison.n_files, comparison.n_compared, comparison.exit_code) == (2, 2 * len(some_rows()), 0)
-    (tmp_path / "candidate" / "open" / "metrics.csv").unlink()
-    with pytest.raises(StudyError, match=r"open/metrics\.csv only in"):
-        compare(tmp_path / "reference", tmp_path / "candidate")
 
 
 def shifted(rows, method, mm, metric=None):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import count, islice, pairwise
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -83,12 +84,7 @@ def find_branches(points: Floats, height_mm: float, name: str = "cloud") -> Bran
     left, right = (
         _seeds(image, sign * x - edge, side, name) for side, (sign, edge) in enumerate(zip((-1, 1), edges, strict=True))
     )
-    # The roots of a level face each other. Where a strip was missed beside the sternum on one side, they do so only in
-    # bands farther out: the nearest pair of bands that fits, else the one that fits best.
-    pairs = sorted(product(range(len(left)), range(len(right))), key=sum)
-    offsets = [float(np.abs(left[i][:, 1] - right[j][:, 1]).max() * PIXEL_MM) for i, j in pairs]
-    chosen = next((k for k, offset in enumerate(offsets) if offset <= MAX_OFFSET_MM), int(np.argmin(offsets)))
-    starts = np.concatenate([left[pairs[chosen][0]], right[pairs[chosen][1]]])
+    starts = _facing(left, right)
     flooded = _flood(image, np.broadcast_to(sternum, image.shape), starts.astype(np.int64))
     branch = flooded[pixels[:, 0], pixels[:, 1]]
     return Branches(branch, edges, starts * PIXEL_MM + origin)
@@ -132,14 +128,41 @@ def _flood(image: Bools, sternum: Bools, starts: Ints) -> Ints:
     return np.where(sternum, 0, branch).astype(np.int64)
 
 
-def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> list[Floats]:
+def _facing(left: Iterator[Floats], right: Iterator[Floats]) -> Floats:
+    """The seeds (8, 2) of both sides, from one band of each.
+
+    The roots of a level face each other. Where a strip was missed beside the sternum on one side, they do so only in
+    bands farther out: the nearest pair of bands that fits, else the one that fits best. A band is searched when its
+    turn comes.
+    """
+    seen: tuple[list[Floats], list[Floats]] = ([], [])
+    best_mm, best = np.inf, np.empty((0, 2))
+    for total in count():  # of both sides' bands, so that near ones come first
+        for found, following in zip(seen, (left, right), strict=True):
+            found += islice(following, 1)
+        if total > len(seen[0]) + len(seen[1]) - 2:
+            return best
+        for i in range(max(0, total + 1 - len(seen[1])), min(total + 1, len(seen[0]))):
+            pair = seen[0][i], seen[1][total - i]
+            offset_mm = float(np.abs(pair[0][:, 1] - pair[1][:, 1]).max() * PIXEL_MM)
+            if offset_mm < best_mm:
+                best_mm, best = offset_mm, np.concatenate(pair)
+            if best_mm <= MAX_OFFSET_MM:
+                return best
+    raise AssertionError("counting does not end")
+
+
+def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> Iterator[Floats]:
     """Four cluster centres (4, 2) beside the sternum (k-means), each snapped to a pixel of its cluster, by rising y.
 
-    The roots of neighbours may touch and a sweep may miss a strip, so the search moves outwards; the answers of every
+    The roots of neighbours may touch and a sweep may miss a strip, so the search moves outwards: one answer for every
     band in which no two centres lie on one cartilage.
+
+    Raises:
+        StudyError: no such band.
     """
     where = ("left", "right")[side]
-    found = []
+    found = False
     for near, far in BANDS_MM:
         candidates = np.argwhere(image & (outwards_mm >= near) & (outwards_mm <= far))
         if len(candidates) < 8:
@@ -159,13 +182,13 @@ def _seeds(image: Bools, outwards_mm: Floats, side: int, name: str) -> list[Floa
                 members = candidates[clusters.labels_ == k]
                 seeds.append(members[np.argmin(np.linalg.norm(members - clusters.cluster_centers_[k], axis=1))])
             if not any(_joined(image, lower, upper) for lower, upper in pairwise(seeds)):
-                found.append(np.array(seeds, dtype=np.float64))
-    if found:
-        return found
-    raise StudyError(
-        f"{name}: expected 4 separate cartilages at the {where} of the sternum as seen from one face, got fewer; "
-        f"{CROP}; if it is so cropped, is a branch missing, or do two touch along their length?"
-    )
+                found = True
+                yield np.array(seeds, dtype=np.float64)
+    if not found:
+        raise StudyError(
+            f"{name}: expected 4 separate cartilages at the {where} of the sternum as seen from one face, got fewer; "
+            f"{CROP}; if it is so cropped, is a branch missing, or do two touch along their length?"
+        )
 
 
 def _joined(image: Bools, one: Ints, other: Ints) -> bool:

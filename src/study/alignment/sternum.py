@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
-from scipy.signal import fftconvolve
 
 from study.errors import StudyError
 from study.geometry.points import close_gaps, pixelise, principal_axes, sample_spacing_mm
@@ -88,11 +88,11 @@ def rectangle_mask(width_mm: float, height_mm: float, pixel_mm: float, angle_deg
     """
     half = int(np.ceil(np.hypot(width_mm, height_mm) / 2 / pixel_mm))
     fine = (np.arange(-half * 5 - 2, half * 5 + 3) / 5) * pixel_mm  # five sub-pixels along each edge
-    x, y = np.meshgrid(fine, fine, indexing="ij")
+    x, y = fine[:, None], fine[None]
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     inside = (np.abs(c * x + s * y) <= width_mm / 2) & (np.abs(-s * x + c * y) <= height_mm / 2)
-    m = 2 * half + 1
-    covered: Floats = inside.reshape(m, 5, m, 5).mean(axis=(1, 3))
+    along_x = np.add.reduce([inside[k::5] for k in range(5)], dtype=np.int64)
+    covered: Floats = np.add.reduce([along_x[:, k::5] for k in range(5)]) / 25
     return covered
 
 
@@ -106,16 +106,23 @@ def _best_place(
     pad = int(np.ceil(reach_mm / 2 / scale_mm)) + 1
     image, _, origin = pixelise(points, scale_mm, pad)
     image = close_gaps(image, round(close_mm / scale_mm)).astype(np.float64)
+    # The padding is wide enough for a circular convolution: what wraps around meets empty pixels.
+    shape = [next_fast_len(length, real=True) for length in image.shape]
+    seen, rows, columns = rfft2(image, shape), *image.shape
+    if near is not None:  # stay on the sternum of the coarser scale
+        away = np.hypot(*(np.indices(image.shape) * scale_mm + origin[:, None, None] - near[:, None, None]))
+        barred = away > 2.5 * params.scales_mm[0]
     fits = []
     for angle in angles:
         mask = rectangle_mask(params.width_mm, params.height_mm, scale_mm, float(angle))
-        covered = fftconvolve(image, mask[::-1, ::-1], mode="same") / mask.sum()
-        if near is not None:  # stay on the sternum of the coarser scale
-            away = np.hypot(*(np.indices(covered.shape) * scale_mm + origin[:, None, None] - near[:, None, None]))
-            covered[away > 2.5 * params.scales_mm[0]] = 0.0
-        ties = np.argwhere(covered >= covered.max() - 1e-6)
-        centre = ties.mean(axis=0) * scale_mm + origin
-        fits.append(SternumFit(centre, float(angle), float(covered.max()), scale_mm))
+        product = irfft2(seen * rfft2(mask[::-1, ::-1], shape), shape)
+        half = len(mask) // 2
+        covered = np.roll(product, (-half, -half), axis=(0, 1))[:rows, :columns] / mask.sum()
+        if near is not None:
+            covered[barred] = 0.0
+        best = float(covered.max())
+        centre = np.argwhere(covered >= best - 1e-6).mean(axis=0) * scale_mm + origin
+        fits.append(SternumFit(centre, float(angle), best, scale_mm))
     return sorted(fits, key=lambda fit: -fit.overlap)
 
 
@@ -168,20 +175,24 @@ def symmetry_axis(points: Floats, half_range_deg: float = 40.0, reach_mm: float 
     image, _, origin = pixelise(points, pixel_mm, pad=4)
     filled = close_gaps(image, round(2 * sample_spacing_mm(points) / pixel_mm))
     x, y = (np.argwhere(filled) * pixel_mm + origin).T
-    edges = np.arange(-reach_mm - 4 * pixel_mm, reach_mm + 4.5 * pixel_mm, pixel_mm)
-    span = np.arange(-200.0, 201.0, pixel_mm)
+    low = -reach_mm - 4 * pixel_mm
+    rows = round(-2 * low / pixel_mm)
+    half = min(int(np.hypot(x, y).max() / pixel_mm + 4 * blur) + 1, 100)  # columns, whichever way the view is turned
+    shifts = np.arange(-8, 9)
+    # In the product of a view and itself, row by row, the mirrored view moved by a shift is an antidiagonal.
+    mirror = (rows - 1 - np.arange(rows) + shifts[:, None]) % rows
     best, answer = -1.0, (0.0, 0.0)
     for step, around in ((2.0, half_range_deg), (0.5, 2.0)):
         centre = answer[0]
         for angle in np.arange(centre - around, centre + around + step / 2, step):
             c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
             across, along = c * x + s * y, c * y - s * x
-            near = np.abs(across) < reach_mm
-            view, _, _ = np.histogram2d(across[near], along[near], bins=(edges, span))
-            view = gaussian_filter(np.minimum(view, 1.0), blur)
-            mirrored = view[::-1]
-            for shift in range(-8, 9):
-                score = float((view * np.roll(mirrored, shift, axis=0)).sum())
-                if score > best:
-                    best, answer = score, (float(angle), shift * pixel_mm / 2)
+            near = (np.abs(across) < reach_mm) & (np.abs(along) < half * pixel_mm)
+            row, column = (across[near] - low) // pixel_mm, along[near] // pixel_mm + half
+            view = np.zeros((rows, 2 * half))
+            view[row.astype(np.int64), column.astype(np.int64)] = 1.0
+            view = gaussian_filter(view, blur)
+            scores = (view @ view.T)[np.arange(rows), mirror].sum(axis=1)
+            if scores.max() > best:
+                best, answer = float(scores.max()), (float(angle), float(shifts[scores.argmax()]) * pixel_mm / 2)
     return answer

@@ -16,6 +16,7 @@ from study.evaluation.pair import TRUTH, Pair, perfect
 from study.files.atomic import sha256_of
 from study.methods import METHODS
 from study.naming import split_sweep
+from study.offline import is_offline
 from study.pipeline import find_method, register_aligned
 from study.results.journal import Journal
 from study.results.metrics_csv import TIMING_COLUMNS, Case, Row, failed_row, metric_rows
@@ -115,6 +116,8 @@ def _fetch(work: Work) -> dict[str, Outcome]:
         hashed = attempt(input_hashes, dataset, name)
         work.inputs[name] = hashed.value or {}
         fetched[name] = hashed if outcome.error is None else outcome
+        if is_offline():
+            fetched[name].get()  # a file that is not here says nothing about a case: better no run than a failed row
         if fetched[name].trace:
             work.traces[_person(name, "files")] = fetched[name].trace
     return fetched

@@ -14,6 +14,7 @@ from study.batch.workers import Workers
 from study.datasets import Dataset, find_dataset
 from study.errors import StudyError
 from study.files.atomic import sha256_of
+from study.files.places import CHECKOUT, is_checkout
 from study.methods import METHODS
 from study.params import find_profile
 from study.pipeline import find_method
@@ -65,6 +66,7 @@ def run_study(
     methods: Iterable[str] | None = None,
     n_jobs: int = 1,
     show_progress: bool = False,
+    scheduler: str | None = None,
 ) -> Run:
     """Run a data set and put ``metrics.csv``, ``timings.csv``, ``provenance.json`` and tables into ``out``, at once.
 
@@ -76,6 +78,7 @@ def run_study(
         methods: names in ``METHODS``; all when None.
         n_jobs: worker processes.
         show_progress: bars on standard error.
+        scheduler: of a Dask cluster whose workers do it instead, as in ``tcp://127.0.0.1:8786``.
 
     Raises:
         StudyError: as `run_dataset`; a folder that is not a run's or that another process is writing; or no case that
@@ -84,7 +87,7 @@ def run_study(
     chosen = chosen_methods(methods)
     dataset.pairs()  # nobody to pair leaves no folder
     with claimed(out) as claim:  # a folder that can't be written is better known now than after the run
-        _run_claimed(dataset, claim, chosen, Workers(n_jobs, show_progress))
+        _run_claimed(dataset, claim, chosen, Workers(n_jobs, show_progress, scheduler))
     return _with_values(Run(out))
 
 
@@ -106,7 +109,13 @@ def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Wo
     record["peak_memory_mb"] = round(work.peak_mb)  # of one process; the timing rows have asked for every step
     record["code_sha256"] = basis["code_sha256"]  # that was run, whatever was edited since
     failures = [f"{' '.join(filter(None, step))}\n{trace}" for step, trace in work.traces.items()]
-    write_run(claim, rows, timings, record, "\n".join(failures))
+    write_run(claim, rows, timings, record, "\n".join(failures), _made_with(dataset))
+
+
+def _made_with(dataset: Dataset) -> dict[str, Path]:
+    """Files that belong beside a run: its manifest, and the lock where there is a checkout."""
+    lock = CHECKOUT / "environment.lock"
+    return {"manifest.yaml": dataset.manifest.path} | ({lock.name: lock} if is_checkout() and lock.is_file() else {})
 
 
 def _with_values(run: Run) -> Run:

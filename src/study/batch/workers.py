@@ -18,6 +18,7 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from study.batch.cluster import arithmetic_of_now, connected, packed, require_same_arithmetic, unpacked
 from study.errors import StudyError
 
 K = TypeVar("K", bound=Hashable)
@@ -56,10 +57,17 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Workers:
-    """Processes that run independent calls, and a bar that shows how far they are."""
+    """Processes that run independent calls, and a bar that shows how far they are.
+
+    Attributes:
+        n_jobs: processes of this machine; 1 for this one alone.
+        show_progress: bars on standard error.
+        scheduler: of a Dask cluster, whose workers are used instead; see `study.batch.cluster`.
+    """
 
     n_jobs: int
     show_progress: bool
+    scheduler: str | None = None
 
     def run(
         self, label: str, calls: Mapping[K, Call], done: Callable[[K, Outcome], None] = lambda *_: None
@@ -72,7 +80,7 @@ class Workers:
             done: told of each outcome as soon as it is there, in any order.
 
         Raises:
-            StudyError: a worker process ended before its call did.
+            StudyError: a worker process ended before its call did; a cluster that cannot be used or was lost.
         """
         keys = list(calls)
         outcomes: dict[K, Outcome] = {}
@@ -90,6 +98,9 @@ class Workers:
         return {key: outcomes[key] for key in keys}
 
     def _outcomes(self, calls: Mapping[K, Call]) -> Iterator[tuple[int, Outcome]]:
+        if self.scheduler is not None:
+            yield from self._on_cluster(self.scheduler, calls) if calls else ()
+            return
         if self.n_jobs == 1:
             yield from ((number, attempt(*call)) for number, call in enumerate(calls.values()))
             return
@@ -101,6 +112,21 @@ class Workers:
                 "expected worker processes to live, got one that ended by itself (is memory short?); finished cases "
                 "are kept: start again to go on, with fewer --jobs"
             ) from error
+
+    def _on_cluster(self, scheduler: str, calls: Mapping[K, Call]) -> Iterator[tuple[int, Outcome]]:
+        """The same on a cluster, a call a task: the cluster gives the task of a worker that died to another one."""
+        expected = arithmetic_of_now()
+        todo = (delayed(_on_worker)(expected, number, packed(call)) for number, call in enumerate(calls.values()))
+        with connected(scheduler):
+            try:
+                yield from Parallel(n_jobs=-1, batch_size=1, return_as="generator_unordered")(todo)
+            except StudyError:
+                raise
+            except Exception as error:  # of the cluster: a call's own failure is an outcome
+                raise StudyError(
+                    f"--scheduler: expected the cluster at {scheduler} to go on, got {type(error).__name__} "
+                    f"{' '.join(str(error).split())[:200]}; finished cases are kept: start again to go on"
+                ) from error
 
 
 def attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:
@@ -128,6 +154,11 @@ def _peak_mb() -> float:
 def _in_worker(parent: int, number: int, *call: Any) -> tuple[int, Outcome]:
     _end_with(parent)
     return number, attempt(*call)
+
+
+def _on_worker(expected: tuple[tuple[str, str], ...], number: int, content: bytes) -> tuple[int, Outcome]:
+    require_same_arithmetic(expected)
+    return number, attempt(*unpacked(content))
 
 
 @cache

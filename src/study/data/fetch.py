@@ -30,6 +30,7 @@ from study.data.store import (
 from study.data.web import RangesRefused, Web
 from study.data.zip_ranges import RemoteArchive, open_remote
 from study.errors import StudyError
+from study.offline import VARIABLE, is_offline
 
 DISK_MARGIN_BYTES = 200 << 20  # what a machine needs to stay usable beside the data
 
@@ -85,11 +86,27 @@ def _fetch_absent(files: list[DataFile], progress: bool, web: Web | None) -> lis
     with one_at_a_time():
         fetcher = _Fetcher(web or Web(), progress)
         absent = [file for file in files if not is_good(file)]  # another process may have fetched some meanwhile
+        if is_offline():
+            _require_no_network(absent)
         fetcher.announce(absent)
         for file in absent:
             path_of(file).unlink(missing_ok=True)
             fetcher.fetch(file)
     return [path_of(file) for file in files]
+
+
+def _require_no_network(absent: list[DataFile]) -> None:
+    told = []
+    for file in absent:
+        source, path = file.source, path_of(file)
+        if isinstance(source, LocalSource) or archive_path(source).exists():
+            continue
+        fault = fault_of(file, path) if path.exists() else f"{file.key}: expected {path}, got no such file"
+        told.append(str(fault))
+    if told:
+        raise StudyError(
+            f"{'; '.join(told)}; nothing is fetched with --offline or {VARIABLE}: run `study data fetch` once without"
+        )
 
 
 class _Fetcher:

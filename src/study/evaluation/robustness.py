@@ -21,8 +21,10 @@ from study.types import PointCloud
 # Each method at its best, and the published graph. The others as shipped are left out: ICP and non-rigid ICP as
 # shipped answer like the tuned ones, shifted; CPD as shipped, whose kernel is narrower than its points' spacing, stays
 # where the coarse alignment put it, which is a row of its own.
-# What the paper does not have is judged on `population` alone.
-ROBUST_METHODS = ("coarse", "icp_tuned", "nonrigid_icp_tuned", "cpd_tuned", "skeleton_graph", "skeleton_graph_tuned")
+ROBUST_METHODS = (
+    *("coarse", "icp_tuned", "nonrigid_icp_tuned", "cpd_tuned", "skeleton_graph", "skeleton_graph_tuned"),
+    *("skeleton_graph_repaired", "bcpd_tuned", "gaussian_process"),
+)
 ERROR, IN_PLANE = "true_waypoint_error", "true_waypoint_error_inplane"
 OK, WARNED, BY_HAND, FAILED = "ok", "warned", "by hand", "failed"
 N_RESAMPLES = 2000

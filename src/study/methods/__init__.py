@@ -78,7 +78,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "nonrigid_icp_tuned_whole": NonrigidIcp.tuned_whole(),
         "cpd_tuned_whole": Cpd.tuned_whole(),
         "skeleton_graph_tuned_whole": SkeletonGraphMethod.tuned_whole(),
-        "skeleton_graph_repaired": VisibleSurface(SkeletonGraphRepaired()),
+        "skeleton_graph_repaired": VisibleSurface(SkeletonGraphRepaired.tuned()),
         "bcpd": Bcpd(),
         "bcpd_tuned": VisibleSurface(Bcpd.tuned()),
         "gaussian_process": VisibleSurface(GaussianProcess()),

@@ -78,7 +78,7 @@ class Bcpd:
     @classmethod
     def tuned(cls) -> Bcpd:
         """The best row of ``results/tuning/bcpd.csv``: the visible surface of development subjects."""
-        return cls(lam=60.0, beta=1.8, gamma=0.3, normalise="source")
+        return cls(lam=20.0, beta=2.5)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> FieldRegistration:
         """Drift ``source`` onto ``target``; nothing is drawn from ``rng``.

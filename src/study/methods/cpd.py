@@ -60,7 +60,7 @@ class Cpd:
     @classmethod
     def tuned(cls) -> Cpd:
         """The best row of ``results/tuning/cpd.csv``: the visible surface of development subjects, by tools/tune.py."""
-        return cls(alpha=0.2, beta_mm=30.0)
+        return cls(alpha=0.005, beta_mm=120.0)
 
     @classmethod
     def tuned_whole(cls) -> Cpd:

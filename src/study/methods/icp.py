@@ -49,7 +49,7 @@ class Icp:
     @classmethod
     def tuned(cls) -> Icp:
         """The best row of ``results/tuning/icp.csv``: the visible surface of development subjects, by tools/tune.py."""
-        return cls(max_distance_mm=2.0, max_iterations=200)
+        return cls(max_distance_mm=7.0, max_iterations=200)
 
     @classmethod
     def tuned_whole(cls) -> Icp:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
 
@@ -78,14 +78,13 @@ class NonrigidIcp:
     @classmethod
     def tuned(cls) -> NonrigidIcp:
         """The best row of ``results/tuning/nonrigid_icp.csv``: the visible surface of development subjects."""
-        return cls(
-            steps=((0.003, 10, 0.5, 10), (0.006, 5, 0.5, 10), (0.009, 2.5, 0.5, 10), (0.003, 0, 0.0, 10)), gamma=30.0
-        )
+        return cls(distance_threshold=0.05)
 
     @classmethod
     def tuned_whole(cls) -> NonrigidIcp:
         """The best row of ``results/tuning/nonrigid_icp_whole.csv``: the whole tube of the same subjects."""
-        return replace(cls.tuned(), distance_threshold=0.05)
+        steps = ((0.003, 10, 0.5, 10), (0.006, 5, 0.5, 10), (0.009, 2.5, 0.5, 10), (0.003, 0, 0.0, 10))
+        return cls(steps=steps, distance_threshold=0.05)
 
     def register(self, source: PointCloud, target: PointCloud, rng: np.random.Generator) -> Registration:
         """Bend ``source`` onto ``target``; nothing is drawn from ``rng``.

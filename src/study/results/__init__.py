@@ -1,6 +1,7 @@
 """Results: ``metrics.csv``, tables, provenance, comparing; a results folder as an object, `Run`."""
 
 from study.results.compare import Comparison, compare
+from study.results.comparisons import Comparisons, compare_all
 from study.results.evidence import Evidence, find_evidence, pairs_table
 from study.results.metrics_csv import CASE, FAILED, read_metrics
 from study.results.run import REFERENCE, Run, against_reference, find_runs, keep_pictures, newest, run_folder
@@ -12,6 +13,7 @@ __all__ = [
     "FAILED",
     "REFERENCE",
     "Comparison",
+    "Comparisons",
     "Evidence",
     "Run",
     "against_reference",
@@ -19,6 +21,7 @@ __all__ = [
     "claim_rows",
     "claims_markdown",
     "compare",
+    "compare_all",
     "find_evidence",
     "find_runs",
     "hd_table",

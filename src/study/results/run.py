@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -21,6 +21,7 @@ from study.files.places import CHECKOUT
 from study.naming import split_sweep
 from study.results.claim import PROVENANCE, Claim, claimed
 from study.results.compare import Comparison, compare
+from study.results.crate import CRATE, crate_text
 from study.results.metrics_csv import (
     CASE,
     FAILED,
@@ -267,8 +268,7 @@ class Run:
                     f"{self.folder}: expected the run as it was made, but it {there.altered}; run it again"
                 )
             names = keep_pictures(self.folder, pictures)
-            hashes = {**there.provenance["files_sha256"], **{name: sha256_of(self.folder / name) for name in names}}
-            write_json({**there.provenance, "files_sha256": hashes}, self.folder / PROVENANCE)
+            _seal(self.folder, [*there.provenance["files_sha256"], *names], there.provenance)
         return names
 
     def _repr_html_(self) -> str:
@@ -291,9 +291,14 @@ class Run:
 
 
 def write_run(
-    claim: Claim, rows: Sequence[Row], timings: Sequence[Row], provenance: Mapping[str, Any], failures: str = ""
+    claim: Claim,
+    rows: Sequence[Row],
+    timings: Sequence[Row],
+    provenance: Mapping[str, Any],
+    failures: str = "",
+    copies: Mapping[str, Path] | None = None,
 ) -> Run:
-    """Write metrics, timings, tables and provenance of a run that has just ended, all at once.
+    """Write everything that tells of a run that has just ended, and describes it, all at once.
 
     Args:
         claim: on its folder.
@@ -301,6 +306,7 @@ def write_run(
         timings: of ``timings.csv``.
         provenance: see `study.results.provenance.provenance`; the hashes of the run's files are added.
         failures: tracebacks of cases that failed in a way nobody foresaw.
+        copies: files that it was made with and that belong beside it, by the name they get.
 
     Raises:
         StudyError: rows that are not of the schema, or a file of somebody else's in the way; nothing is changed then.
@@ -311,10 +317,20 @@ def write_run(
     if failures:
         write_text(new / FAILURES_LOG, failures)
     write_tables(read_metrics(new / "metrics.csv"), new)
-    hashes = {path.name: sha256_of(path) for path in new.iterdir()}
-    write_json({**provenance, "files_sha256": hashes}, new / PROVENANCE)
+    write_json(provenance["parameters"], new / "parameters.json")
+    for name, path in (copies or {}).items():
+        write_bytes(new / name, path.read_bytes())
+    _seal(new, [path.name for path in new.iterdir()], provenance)
     claim.swap_in()
     return Run(claim.folder)
+
+
+def _seal(folder: Path, names: Iterable[str], provenance: Mapping[str, Any]) -> None:
+    """Describe the files of a run, and hold them to what they are now by their hashes."""
+    files = sorted({*names} - {CRATE})
+    write_text(folder / CRATE, crate_text(folder, files, provenance))
+    hashes = {name: sha256_of(folder / name) for name in (*files, CRATE)}
+    write_json({**provenance, "files_sha256": hashes}, folder / PROVENANCE)
 
 
 def find_runs(folder: Path) -> list[Run]:

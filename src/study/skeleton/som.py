@@ -103,8 +103,8 @@ def neighbourhood(hops: Ints, radius: float) -> Floats:
 
 
 @njit(cache=True)
-def _epoch(nodes, points, classes, barred, first, near, theta, rate):  # type: ignore[no-untyped-def]
-    """One epoch of Eq. 2 in place: nodes (3, m), points (k, 3) with classes (k,) into barred (c, m).
+def _epoch(nodes, points, drawn, classes, barred, first, near, theta, rate):  # type: ignore[no-untyped-def]
+    """One epoch of Eq. 2 in place: nodes (3, m), rows drawn (k,) of points (n, 3) with classes (n,) into barred (c, m).
 
     Winner w pulls the nodes ``near[first[w] : first[w + 1]]`` by ``theta`` of the same rows: theta is 0 elsewhere.
     """
@@ -112,15 +112,19 @@ def _epoch(nodes, points, classes, barred, first, near, theta, rate):  # type: i
     m = nodes.shape[1]
     x, y, z = nodes[0], nodes[1], nodes[2]
     apart = np.empty(m)
-    for k in range(points.shape[0]):
+    # Floats of 0 or more are ordered as the integers of their bits; unlike the floats' own least, which must mind NaN,
+    # that of integers is found several at a time.
+    bits = apart.view(np.int64)
+    for k in drawn:
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
         bar = barred[classes[k]]
+        least = np.int64(np.iinfo(np.int64).max)
         for s in range(m):
             apart[s] = (px - x[s]) ** 2 + (py - y[s]) ** 2 + (pz - z[s]) ** 2 + bar[s]
+            least = min(least, bits[s])
         winner = 0
-        for s in range(1, m):
-            if apart[s] < apart[winner]:
-                winner = s
+        while bits[winner] != least:
+            winner += 1
         for j in range(first[winner], first[winner + 1]):  # Eq. 2
             s, step = near[j], theta[j] * rate
             x[s] += step * (px - x[s])
@@ -160,7 +164,7 @@ def fit_som(
             theta = csr_array(neighbourhood(hops, radius))
         drawn = rng.integers(len(points), size=params.samples)
         pull = theta.indptr, theta.indices, theta.data
-        _epoch(nodes, points[drawn], classes[drawn], barred, *pull, params.rate_at(epoch))
+        _epoch(nodes, points, drawn, classes, barred, *pull, params.rate_at(epoch))
         if epoch >= 0 and (epoch % max(1, params.epochs // N_CHECKS) == 0 or epoch == params.epochs - 1):
             history.append(quantisation_error_mm(nodes.T, points))
     return graph.with_nodes(nodes.T), tuple(history)

@@ -1,4 +1,4 @@
-"""The command line: data, run, compare, register, cloud, sweep, report."""
+"""The command line: data, run, compare, rerun, register, cloud, sweep, report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 import click
 
 from study import __version__
+from study.cli.comparing import compare, rerun
 from study.errors import StudyError
+from study.offline import go_offline
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,11 +29,14 @@ DATASETS = "A name in data_manifest.yaml (`study datasets` lists them), or a man
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="study")
 @click.option("--traceback", is_flag=True, envvar="STUDY_TRACEBACK", help="Show where an unforeseen error arose.")
+@click.option("--offline", is_flag=True, help="Refuse every connection beyond this machine, as STUDY_OFFLINE=1 does.")
 @click.pass_context
-def cli(context: click.Context, traceback: bool) -> None:
+def cli(context: click.Context, traceback: bool, offline: bool) -> None:
     """Thoracic cartilage ultrasound-CT registration with a dense skeleton graph, as a reproducible study."""
     if isinstance(context.obj, dict):  # `main`, which asks for it after the context has gone
         context.obj["traceback"] = traceback
+    if offline:
+        go_offline()
 
 
 @cli.group()
@@ -112,12 +117,17 @@ def list_datasets(reported: bool, evidence: bool) -> None:
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1), help="Worker processes.")
 @click.option(
+    "--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask cluster; see docs/scaling.md."
+)
+@click.option(
     "--out",
     type=click.Path(path_type=Path),
     help="Folder of results.  [default: results/runs/<dataset> here for the full profile, all methods and seed 0, "
     "else a folder of its own below results/trials]",
 )
-def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, out: Path | None) -> None:
+def run(
+    dataset: str, profile: str, methods: str | None, seed: int, jobs: int, scheduler: str | None, out: Path | None
+) -> None:
     """Run every pair of a dataset with every method.
 
     A run that was stopped goes on when the same command is given again: finished cases are kept beside its folder.
@@ -127,11 +137,13 @@ def run(dataset: str, profile: str, methods: str | None, seed: int, jobs: int, o
     from study.params import find_profile
     from study.results.run import run_folder
 
+    if scheduler is not None and jobs != 1:
+        raise StudyError("expected either --jobs or --scheduler, got both; the cluster says how many workers there are")
     chosen = None if methods is None else [name.strip() for name in methods.split(",")]
     people = find_dataset(dataset, find_profile(profile), seed)
     if out is None:
         out = run_folder(people.name, profile, seed, chosen, Path())
-    _report(run_study(people, out, methods=chosen, n_jobs=jobs, show_progress=True))
+    _report(run_study(people, out, methods=chosen, n_jobs=jobs, show_progress=True, scheduler=scheduler))
 
 
 @cli.command(short_help="Gather what `make evidence` shows: robustness, sensitivity, more people.")
@@ -206,21 +218,8 @@ def anatomy(dataset: str, out: Path) -> None:
     click.echo(f"{len(table)} measurements of {len(people.names())} subjects: {out}")
 
 
-@cli.command(short_help="Check a run against a reference.")
-@click.argument("reference", type=click.Path(path_type=Path))
-@click.argument("candidate", type=click.Path(path_type=Path))
-def compare(reference: Path, candidate: Path) -> None:
-    """Check a run against a reference.
-
-    Every value and every method's mean must be within its metric's tolerance, and the methods in the same order.
-
-    Exit code 0: agrees; 1: differs, the largest differences are listed; 2: can't be compared.
-    """
-    from study.results.compare import compare as compare_runs
-
-    comparison = compare_runs(reference, candidate)
-    click.echo(comparison.report())
-    click.get_current_context().exit(comparison.exit_code)
+cli.add_command(compare)
+cli.add_command(rerun)
 
 
 @cli.command(short_help="Register two clouds of one's own.")
@@ -374,7 +373,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return UNFORESEEN
     return code or 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
