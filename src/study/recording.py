@@ -87,7 +87,7 @@ def cloud_of_recording(
     write_bytes(picture, figures.png(_picture(masked, made)))
     write_json(content, report)
     counts = Counter(masked.fates)
-    front = ",".join(f"{value:.3f}" for value in made.front)
+    front = ",".join(f"{value:.3f}" for value in np.round(made.front, 3) + 0.0)  # no minus before a zero
     lines = [*masked.notes, f"latency {1000 * masked.sweep.latency_s:.0f} ms taken out of the frames' stamps"]
     lines += [f"frames {fate}: {n} of {len(masked.fates)}" for fate, n in counts.most_common()]
     if counts[USED] < FEW_USED * len(masked.fates):
