@@ -65,7 +65,7 @@ def test_images_are_turned_to_mf(tmp_path, orientation, expected):
 def test_foreign_poses_bases_and_calibration(tmp_path):
     calibrated = {f"Seq_Frame{i:04d}_ImageToProbeTransform": "0 -0.3 0 4 0.2 0 0 5 0 0 0.2 6 0 0 0 1" for i in range(2)}
     path = foreign(tmp_path / "a.igs.mha", **calibrated, Seq_Frame0001_ProbeToTrackerTransformStatus="INVALID")
-    sweep = read_plus(path)
+    sweep = read_plus(path, base="Tracker")
     np.testing.assert_array_equal(sweep.poses[0, :3, 3], [0, 0, 7])
     assert list(sweep.pose_valid) == [True, False]
     assert sweep.latency_s == 0
@@ -74,6 +74,8 @@ def test_foreign_poses_bases_and_calibration(tmp_path):
     np.testing.assert_array_equal(sweep.T_probe_image.translation, [4, 5, 6])
     # In the reference's frame: inv([[0,-1,0],[1,0,0],[0,0,1]], t = (0,5,0)) applied to (0, 0, 7).
     np.testing.assert_allclose(read_plus(path, base="Reference").poses[0, :3, 3], [-5, 0, 7], atol=1e-12)
+    assert read_plus(path).frame_names == ("Probe", "Reference")
+    np.testing.assert_array_equal(read_plus(path).poses, read_plus(path, base="Reference").poses)
     own = read_plus(path, pixel_spacing_mm=(1, 1), T_probe_image=RigidTransform(), latency_s=0.1)
     assert (own.pixel_spacing_mm, own.latency_s) == ((1, 1), 0.1)
 
@@ -104,7 +106,10 @@ ZIPPED = {"CompressedData": "True"}
         ({"DimSize": "3 2 1", "pixels": bytes(6)}, "mis-sized"),
         ({"drop": ("DimSize",)}, "columns, rows and frames"),
         ({"ElementType": "MET_DOUBLE"}, "ElementType"),
-        ({"ElementNumberOfChannels": "3"}, "one channel"),
+        ({"ElementNumberOfChannels": "5"}, "one channel"),
+        ({"ElementNumberOfChannels": "3"}, "expected 36 bytes"),
+        ({"NDims": "4"}, "NDims 4"),
+        ({"DimSize": "3 1 2 2", "NDims": "4"}, "columns, rows and frames"),
         ({"UltrasoundImageOrientation": "XX"}, "UltrasoundImageOrientation"),
         ({"drop": ("ObjectType",)}, "ObjectType first"),
         ({"drop": ("Seq_Frame0001_Timestamp",)}, "frame 1: expected a field Timestamp"),
@@ -229,7 +234,7 @@ def test_other_files_are_refused(tmp_path):
 def test_the_real_plus_file():
     if not REAL.exists():
         pytest.skip(f"no PLUS example at {REAL}: it is not part of the repository (PlusLibData, BSD-3)")
-    sweep = read_plus(REAL)
+    sweep = read_plus(REAL, base="Tracker")
     assert sweep.images.shape == (21, 616, 820)
     assert sweep.images.dtype == np.uint8
     np.testing.assert_array_equal(sweep.images, sitk.GetArrayFromImage(sitk.ReadImage(str(REAL))))
@@ -248,7 +253,9 @@ def test_the_real_plus_file():
             [0, 0, 0, 1],
         ]
     )
-    np.testing.assert_allclose(T_tracker_reference @ read_plus(REAL, base="Reference").poses[0], sweep.poses[0])
+    in_reference = read_plus(REAL)
+    np.testing.assert_allclose(T_tracker_reference @ in_reference.poses[0], sweep.poses[0])
+    assert "base frame Reference" in in_reference.notes[0]
     with pytest.raises(StudyError, match="got ProbeToTrackerTransform, ReferenceToTracker"):
         read_plus(REAL, probe="Needle")
 
@@ -260,3 +267,50 @@ def test_the_real_file_written_reads_back(tmp_path):
     short = dataclasses.replace(sweep, frame_times_s=sweep.frame_times_s[:3], images=sweep.images[:3])
     write_plus(tmp_path / "b.igs.mha", short)
     assert_identical(read_plus(tmp_path / "b.igs.mha"), short)
+
+
+def test_the_choice_of_base_is_said(tmp_path):
+    path = foreign(tmp_path / "a.igs.mha")
+    np.testing.assert_allclose(read_plus(path).poses[0, :3, 3], [-5, 0, 7], atol=1e-12)
+    assert read_plus(path).notes == (
+        "base frame Reference, which moves with the patient: ReferenceToTrackerTransform is in the file",
+    )
+    lost = {f"Seq_Frame{i:04d}_ReferenceToTrackerTransformStatus": "INVALID" for i in range(2)}
+    unseen = read_plus(foreign(tmp_path / "b.igs.mha", **lost))
+    assert unseen.frame_names == ("Probe", "Tracker")
+    assert "not valid in any frame" in unseen.notes[0]
+    without = read_plus(
+        foreign(tmp_path / "c.igs.mha", drop=[f"Seq_Frame{i:04d}_ReferenceToTrackerTransform" for i in range(2)])
+    )
+    assert without.notes == ("base frame Tracker: no ReferenceToTrackerTransform is in the file",)
+    apart = {
+        "Seq_Frame0000_ReferenceToTrackerTransformStatus": "INVALID",
+        "Seq_Frame0001_ProbeToTrackerTransformStatus": "INVALID",
+    }
+    with pytest.raises(StudyError, match="see Probe and Reference at once, got none of 2"):
+        read_plus(foreign(tmp_path / "d.igs.mha", **apart))
+
+
+def test_a_slice_axis_of_one_and_rgb_frames(tmp_path):
+    np.testing.assert_array_equal(
+        read_plus(foreign(tmp_path / "a.mha", NDims="4", DimSize="3 2 1 2")).images.ravel(), np.arange(12)
+    )
+    grey = np.repeat(np.arange(12, dtype=np.uint8), 3)
+    sweep = read_plus(foreign(tmp_path / "b.mha", ElementNumberOfChannels="3", pixels=grey.tobytes()))
+    np.testing.assert_array_equal(sweep.images.ravel(), np.arange(12))
+    assert "RGB frames were turned to grey (luma of BT.601); 0.0 % of their pixels had a colour" in sweep.notes
+    coloured = grey.reshape(12, 3).copy()
+    coloured[:6] = [200, 0, 0]
+    sweep = read_plus(foreign(tmp_path / "c.mha", ElementNumberOfChannels="3", pixels=coloured.tobytes()))
+    assert (sweep.images[0] == 60).all()
+    assert "50.0 % of their pixels had a colour" in sweep.notes[0]
+
+
+def test_pixels_beside_the_header(tmp_path):
+    whole = foreign(tmp_path / "a.mha").read_bytes()
+    head, _, data = whole.partition(b"ElementDataFile = LOCAL\n")
+    (tmp_path / "a.mhd").write_bytes(head + b"ElementDataFile = a.raw\n")
+    with pytest.raises(StudyError, match="beside the header"):
+        read_plus(tmp_path / "a.mhd")
+    (tmp_path / "a.raw").write_bytes(data)
+    np.testing.assert_array_equal(read_plus(tmp_path / "a.mhd").images.ravel(), np.arange(12))

@@ -1,4 +1,4 @@
-"""The command line: data, run, notebooks, compare, rerun, register, cloud, report."""
+"""The command line: data, run, notebooks, compare, rerun, register, cloud, landmarks, sweep, report."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import click
 from study import __version__
 from study.cli.comparing import compare, rerun
 from study.cli.notebooks import notebooks
+from study.cli.sweeping import sweep
 from study.errors import StudyError
 from study.offline import go_offline
 
@@ -258,6 +259,7 @@ def anatomy(dataset: str, out: Path) -> None:
 
 cli.add_command(compare)
 cli.add_command(rerun)
+cli.add_command(sweep)
 
 
 @cli.command(short_help="Register two clouds of one's own.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from study.errors import StudyError
 from study.figures.canvas import (
@@ -28,9 +29,9 @@ from study.figures.canvas import (
     thin,
 )
 from study.figures.style import CT_COLOUR, DARK, LEVEL_COLOUR, US_COLOUR, steps
-from study.types import Mesh, PointCloud, RigidTransform
+from study.types import Bools, Floats, Mesh, PointCloud, RigidTransform
 
-__all__ = ["frame_with_mask", "latency_fit", "sweep_in_space"]
+__all__ = ["frame_with_mask", "latency_fit", "sweep_in_space", "sweep_overview"]
 
 
 def sweep_in_space(
@@ -85,6 +86,58 @@ def sweep_in_space(
     marks += [Patch(color="#dbdbdb", label="true surface")] if mesh is not None else []
     marks += [Line2D([], [], color=DARK, lw=0.8, label="transducer, some frames")] if len(ends) else []
     below(figure, marks, 4)
+    return figure
+
+
+def sweep_overview(
+    cloud: PointCloud,
+    beam: Floats,
+    shots: Sequence[tuple[str, NDArray[Any] | None, Bools]],
+    pixel_spacing_mm: tuple[float, float],
+    *,
+    title: str,
+) -> Figure:
+    """What a sweep of one's own gave: its cloud as the probe saw it, and some frames with the edge that was used.
+
+    Args:
+        cloud: (n, 3) mm, any frame; coloured by its times where it has them.
+        beam: (3,) unit vector, the mean direction of the beams, same frame.
+        shots: of some frames a title, the image (h, w) or None, and the mask (h, w).
+        pixel_spacing_mm: (sx, sy), lateral and along the beam.
+        title: above it.
+
+    Raises:
+        StudyError: no frames to show.
+    """
+    require(shots, "frames")
+    centred = cloud.points - cloud.points.mean(axis=0)
+    flat = centred - np.outer(centred @ beam, beam)
+    long = np.linalg.svd(flat, full_matrices=False)[2][0]
+    across = np.cross(beam, long)  # long is up the page, the beam away from the viewer
+    figure = new_figure(5.2, title)
+    parts: Any = figure.subfigures(1, 2, width_ratios=[1, 1.15])
+    left, right = parts
+    ax = left.subplots()
+    clock = centred @ beam if cloud.times is None else cloud.times - cloud.times.min()
+    drawn = ax.scatter(centred @ across, centred @ long, c=clock, s=3, cmap=steps("plasma"), lw=0, rasterized=True)
+    ax.set_aspect("equal")
+    plain(ax, f"cloud, {len(cloud):,} points, seen from the probe")
+    ax.set_xlabel("across the sweep's longest way (mm)", fontsize=8)
+    ax.set_ylabel("along it (mm)", fontsize=8)
+    bar = left.colorbar(drawn, ax=ax, shrink=0.7, pad=0.01)
+    bar.set_label("depth (mm)" if cloud.times is None else "time of the sweep (s)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    panels = right.subplots(2, (len(shots) + 1) // 2, squeeze=False).ravel()
+    sx, sy = pixel_spacing_mm
+    for ax, (text, image, mask) in zip(panels, shots, strict=False):
+        rows, columns = mask.shape
+        behind = np.zeros(mask.shape) if image is None else image
+        ax.imshow(behind, cmap="gray", extent=(-sx / 2, (columns - 0.5) * sx, (rows - 0.5) * sy, -sy / 2))
+        seen = np.flatnonzero(mask.any(axis=0))
+        ax.scatter(seen * sx, (mask.argmax(axis=0)[seen] - 0.5) * sy, s=1.5, c=LEVEL_COLOUR[3], lw=0)
+        plain(ax, text)
+    for ax in panels[len(shots) :]:
+        ax.set_axis_off()
     return figure
 
 

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from study.files.calibration import read_calibration, write_calibration
     from study.files.clouds import read_ply, read_timed_ply, write_ply
     from study.files.landmarks import read_landmarks
     from study.files.plus import read_plus
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from study.files.waypoints import read_waypoints
 
 __all__ = [
+    "read_calibration",
     "read_folder",
     "read_labels",
     "read_landmarks",
@@ -23,6 +25,7 @@ __all__ = [
     "read_timed_ply",
     "read_volume",
     "read_waypoints",
+    "write_calibration",
     "write_folder",
     "write_plus",
     "write_ply",
@@ -31,6 +34,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "read_calibration": "calibration",
     "read_folder": "sweep_folder",
     "read_labels": "volumes",
     "read_landmarks": "landmarks",
@@ -40,6 +44,7 @@ _HOMES = {
     "read_timed_ply": "clouds",
     "read_volume": "volumes",
     "read_waypoints": "waypoints",
+    "write_calibration": "calibration",
     "write_folder": "sweep_folder",
     "write_plus": "plus_write",
     "write_ply": "clouds",

@@ -1,7 +1,8 @@
-"""Writing PLUS sequence metafiles, so that a sweep opens in 3D Slicer and comes back as it was."""
+"""Writing PLUS sequence files, so that a sweep opens in 3D Slicer and comes back as it was."""
 
 from __future__ import annotations
 
+import gzip
 import math
 import os
 import zlib
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from study.errors import StudyError
 from study.files.atomic import write_bytes
-from study.files.plus import ELEMENT_TYPES
+from study.files.sequences import ELEMENT_TYPES
 from study.ultrasound.tracked import TrackedSweep
 
 Content = Literal["masks", "images"]
@@ -26,13 +27,14 @@ def write_plus(
     content: Content | None = None,
     compress: bool = True,
 ) -> None:
-    """Write a sweep as a PLUS sequence metafile, which 3D Slicer opens.
+    """Write a sweep as a PLUS sequence file, metafile or NRRD, which 3D Slicer opens.
 
     A frame's transform is the pose at the moment the frame shows, so other programs place it correctly. What
-    PLUS has no field for (poses between the frames, latency, exact spacing) goes into fields named ``Study_…``.
+    PLUS has no field for (poses between the frames, latency, exact spacing) goes into fields named ``Study_…``; what
+    the recording said of other tools is written as it was.
 
     Args:
-        path: ends in ``.igs.mha`` or ``.seq.mha``.
+        path: ends in ``.igs.mha``, ``.seq.mha`` or ``.nrrd``.
         sweep: what to write.
         content: which stack to write where the sweep has both; a file holds one.
         compress: deflate the pixels.
@@ -41,18 +43,24 @@ def write_plus(
         StudyError: another ending, a stack the sweep lacks, or pixels of a type a metafile cannot hold.
     """
     path = Path(path)
-    if not path.name.endswith((".igs.mha", ".seq.mha")):
-        raise StudyError(f"{path.name}: expected a name ending in .igs.mha or .seq.mha, or no program will know it")
+    if not path.name.endswith((".igs.mha", ".seq.mha", ".nrrd")):
+        raise StudyError(
+            f"{path.name}: expected a name ending in .igs.mha, .seq.mha or .nrrd, or no program will know it"
+        )
     content = content or _only_content(path, sweep)
     pixels = _pixels(path, sweep, content)
     data = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<")).tobytes()
+    fields = [*_study_fields(sweep, content), *_pose_fields(sweep), *_frame_fields(sweep)]
+    if path.name.endswith(".nrrd"):
+        write_bytes(
+            path, _nrrd_head(pixels, fields, compress) + (gzip.compress(data, 6, mtime=0) if compress else data)
+        )
+        return
     if compress:
         data = zlib.compress(data, 6)
     lines = [
         *_image_lines(pixels, len(data) if compress else None),
-        *_study_lines(sweep, content),
-        *_pose_lines(sweep),
-        *_frame_lines(sweep),
+        *(f"{key} = {value}" for key, value in fields),
         "ElementDataFile = LOCAL\n",
     ]
     write_bytes(path, "\n".join(lines).encode() + data)
@@ -106,49 +114,74 @@ def _image_lines(pixels: NDArray[Any], n_compressed: int | None) -> list[str]:
     ]
 
 
-def _study_lines(sweep: TrackedSweep, content: Content) -> list[str]:
-    """What PLUS has no field for, the poses apart."""
+def _nrrd_head(pixels: NDArray[Any], fields: list[tuple[str, str]], compress: bool) -> bytes:
+    """The header of an NRRD file as PLUS lays it out: a list of flat frames."""
+    f, h, w = pixels.shape
+    kind = {"u": "uint", "i": "int"}.get(pixels.dtype.kind, "")
     lines = [
-        f"Study_Name = {' '.join(sweep.name.split())}",
-        f"Study_Content = {content}",
-        f"Study_LatencyS = {_text(sweep.latency_s)}",
+        "NRRD0004",
+        f"type: {kind}{8 * pixels.dtype.itemsize}" if kind else "type: float",
+        "dimension: 3",
+        f"sizes: {w} {h} {f}",
+        "kinds: domain domain list",
+        "space dimension: 2",
+        "space directions: (1,0) (0,1) none",
+        "space origin: (0,0)",
+        "endian: little",
+        f"encoding: {'gzip' if compress else 'raw'}",
+        "ultrasound image orientation:=MF",
+        "ultrasound image type:=BRIGHTNESS",
+        # PLUS calls a frame's status by another name here than in a metafile.
+        *(f"{key.replace('_ImageStatus', '_Status')}:={value}" for key, value in fields),
+    ]
+    return "\n".join([*lines, "", ""]).encode()
+
+
+def _study_fields(sweep: TrackedSweep, content: Content) -> list[tuple[str, str]]:
+    """What PLUS has no field for, the poses apart."""
+    fields = [
+        ("Study_Name", " ".join(sweep.name.split())),
+        ("Study_Content", content),
+        ("Study_LatencyS", _text(sweep.latency_s)),
+        ("Study_Frames", " ".join(sweep.frame_names)),
     ]
     if sweep.pixel_spacing_mm is not None:
-        lines.append(f"Study_PixelSpacingMm = {_text(*sweep.pixel_spacing_mm)}")
+        fields.append(("Study_PixelSpacingMm", _text(*sweep.pixel_spacing_mm)))
     if sweep.T_probe_image is not None:
-        lines.append(f"Study_ProbeImageTransform = {_text(*sweep.T_probe_image.matrix.ravel())}")
-    return lines
+        fields.append(("Study_ProbeImageTransform", _text(*sweep.T_probe_image.matrix.ravel())))
+    return fields + [(f"Study_Note{i:02d}", " ".join(note.split())) for i, note in enumerate(sweep.notes)]
 
 
-def _pose_lines(sweep: TrackedSweep) -> list[str]:
+def _pose_fields(sweep: TrackedSweep) -> list[tuple[str, str]]:
     """Every pose with its own time: a frame's transform is an interpolation between two of them."""
     return [
-        f"Study_Pose{i:06d} = {_text(time)} {'OK' if valid else 'INVALID'} {_text(*pose.ravel())}"
+        (f"Study_Pose{i:06d}", f"{_text(time)} {'OK' if valid else 'INVALID'} {_text(*pose.ravel())}")
         for i, (time, valid, pose) in enumerate(zip(sweep.pose_times_s, sweep.pose_valid, sweep.poses, strict=True))
     ]
 
 
-def _frame_lines(sweep: TrackedSweep) -> list[str]:
-    """The fields of each frame as PLUS names them."""
+def _frame_fields(sweep: TrackedSweep) -> list[tuple[str, str]]:
+    """The fields of each frame as PLUS names them, and those the recording had."""
+    probe, base = sweep.frame_names
+    over = f"{base}ToTrackerTransform"
+    # A recording's own way round: probe and base each over the tracker. A third transform would close a ring.
+    by_tracker = any(over in fields for fields in sweep.frame_fields.values())
+    key = f"{probe}To{'Tracker' if by_tracker else base}Transform"
     image_to_probe = _image_to_probe(sweep)
-    lines = []
+    written = []
     poses, _, tracked = sweep.frame_poses()
-    for i in range(sweep.n_frames):
-        pose, status = (poses[i], "OK") if tracked[i] else (np.eye(4), "INVALID")
-        lines += [
-            f"Seq_Frame{i:04d}_ProbeToTrackerTransform = {_text(*pose.ravel())}",
-            f"Seq_Frame{i:04d}_ProbeToTrackerTransformStatus = {status}",
-        ]
+    for i, time in enumerate(sweep.frame_times_s.tolist()):
+        others = sweep.frame_fields.get(time, {})
+        pose, ok = (poses[i], True) if tracked[i] else (np.eye(4), False)
+        if by_tracker:
+            ok = ok and over in others and others.get(f"{over}Status", "OK") == "OK"
+            pose = np.array(others[over].split(), dtype=np.float64).reshape(4, 4) @ pose if ok else np.eye(4)
+        fields = {key: _text(*pose.ravel()), f"{key}Status": "OK" if ok else "INVALID"}
         if image_to_probe is not None:
-            lines += [
-                f"Seq_Frame{i:04d}_ImageToProbeTransform = {image_to_probe}",
-                f"Seq_Frame{i:04d}_ImageToProbeTransformStatus = OK",
-            ]
-        lines += [
-            f"Seq_Frame{i:04d}_Timestamp = {_text(sweep.frame_times_s[i])}",
-            f"Seq_Frame{i:04d}_ImageStatus = OK",
-        ]
-    return lines
+            fields |= {f"ImageTo{probe}Transform": image_to_probe, f"ImageTo{probe}TransformStatus": "OK"}
+        fields = {**others, **fields, "Timestamp": _text(time), "ImageStatus": "OK"}
+        written += [(f"Seq_Frame{i:04d}_{name}", value) for name, value in fields.items()]
+    return written
 
 
 def _image_to_probe(sweep: TrackedSweep) -> str | None:

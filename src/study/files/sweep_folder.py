@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from study.errors import StudyError
 from study.files.atomic import replacing, write_text
-from study.files.plus import METRES_BELOW_MM, check_masks
-from study.types import Bools, RigidTransform
+from study.files.plus_config import METRES_BELOW_MM
+from study.files.sweep_masks import read_png_masks
+from study.types import RigidTransform
 from study.ultrasound.tracked import TrackedSweep
 
 POSE_COLUMNS = ["time_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
@@ -36,7 +37,7 @@ def read_folder(folder: str | os.PathLike[str]) -> TrackedSweep:
     folder = Path(folder)
     frames = _read_table(folder / "frames.csv", ["file", "time_s"])
     poses_table = _read_table(folder / "poses.csv", POSE_COLUMNS)
-    masks = _read_masks(folder, [str(name) for name in frames["file"]])
+    masks = read_png_masks(folder, [str(name) for name in frames["file"]], "frames.csv")
     numbers = poses_table[POSE_COLUMNS].to_numpy(dtype=np.float64)
     valid = poses_table["valid"].to_numpy() != 0 if "valid" in poses_table else np.ones(len(numbers), dtype=bool)
     lengths = np.linalg.norm(numbers[:, 4:], axis=1)
@@ -138,36 +139,3 @@ def _read_settings(path: Path) -> dict[str, Any]:
             f"{path.name}: expected an object with {', '.join(sorted(known))}, got other keys; check the names"
         )
     return settings
-
-
-def _read_masks(folder: Path, names: list[str]) -> Bools:
-    """Masks (f, h, w); every image's size is checked before its pixels are read."""
-    masks, reader = None, sitk.ImageFileReader()
-    for i, name in enumerate(names):
-        path = folder / name
-        if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
-            raise StudyError(f"frames.csv: expected {name!r} to be an image in the folder, got none; correct row {i}")
-        reader.SetFileName(str(path))
-        try:
-            reader.ReadImageInformation()
-            size, channels = reader.GetSize(), reader.GetNumberOfComponents()
-            if channels != 1 or len(size) != 2:
-                raise StudyError(
-                    f"{name}: expected a grey image, got {channels} channels; save masks as 8-bit grey PNG"
-                )
-            if masks is None:
-                masks = np.zeros((len(names), size[1], size[0]), dtype=bool)
-            if (size[1], size[0]) != masks.shape[1:]:
-                raise StudyError(
-                    f"{name}: expected {masks.shape[2]} x {masks.shape[1]} pixels as in the first mask, got"
-                    f" {size[0]} x {size[1]}; export all frames alike"
-                )
-            pixels = sitk.GetArrayFromImage(reader.Execute())
-            check_masks(pixels, name)
-            masks[i] = pixels > 0
-        except RuntimeError as error:
-            raise StudyError(
-                f"{name}: expected a readable image, got a damaged one ({type(error).__name__}); export it again"
-            ) from error
-    assert masks is not None  # the table has rows
-    return masks

@@ -1,7 +1,17 @@
 """Tracked ultrasound (sec. II): calibrations, masks to cloud; the virtual sweep and the sizes of its errors."""
 
 from study.ultrasound.b_mode import b_mode_like, ct_frame, frame_below, frame_of, skin_depth_mm
-from study.ultrasound.cloud import SweepCloud, SweepReport, contour_points, sweep_cloud, thin_evenly, upper_contour
+from study.ultrasound.bmode import BONE, CARTILAGE, Echo, simulate_bmode
+from study.ultrasound.bone_surface import BoneFinder, BoneSurface, find_bone_surface, mask_sweep
+from study.ultrasound.cloud import (
+    SweepCloud,
+    SweepReport,
+    contour_points,
+    frame_fates,
+    sweep_cloud,
+    thin_evenly,
+    upper_contour,
+)
 from study.ultrasound.constant_shift import constant_shift_mm
 from study.ultrasound.probe import Probe
 from study.ultrasound.spatial import SpatialCalibration, calibrate_spatial
@@ -13,8 +23,13 @@ from study.ultrasound.virtual_sweep import simulate_sweep
 from study.ultrasound.visible import true_parts, visible_mesh, visible_surface
 
 __all__ = [
+    "BONE",
+    "CARTILAGE",
     "ERROR_SOURCES",
     "LATENCY_S",
+    "BoneFinder",
+    "BoneSurface",
+    "Echo",
     "LatencyCalibration",
     "Probe",
     "SpatialCalibration",
@@ -30,8 +45,12 @@ __all__ = [
     "contour_points",
     "ct_frame",
     "error_table",
+    "find_bone_surface",
     "frame_below",
+    "frame_fates",
     "frame_of",
+    "mask_sweep",
+    "simulate_bmode",
     "simulate_calibration_views",
     "simulate_latency_run",
     "simulate_sweep",

@@ -11,6 +11,9 @@ from study.errors import StudyError
 from study.types import Bools, Floats, Ints, PointCloud, RigidTransform
 from study.ultrasound.tracked import TrackedSweep
 
+USED, EMPTY = "used", "nothing in its mask"
+OUTSIDE, UNTRACKED = "outside the tracked time", "no valid pose before or after, or too long a gap"
+
 
 @dataclass(frozen=True)
 class SweepReport:
@@ -148,6 +151,22 @@ def _contours(masks: Bools, used: Ints, chunk: int) -> tuple[Ints, Ints, Floats]
         parts.append((block[frames], columns, rows))
     frames, columns, rows = (np.concatenate([part[i] for part in parts]) for i in range(3))
     return frames, columns, rows
+
+
+def frame_fates(sweep: TrackedSweep, *, max_gap_s: float = 0.25) -> list[str]:
+    """What becomes of each frame in `sweep_cloud`: ``"used"``, or why it gives no point.
+
+    Raises:
+        StudyError: no masks.
+    """
+    if sweep.masks is None:
+        raise StudyError(f"{sweep.name}: expected a mask per frame, got B-mode only; annotate the frames first")
+    _, inside, tracked = sweep.frame_poses(max_gap_s)
+    filled = [bool(mask.any()) for mask in sweep.masks]
+    return [
+        OUTSIDE if not within else UNTRACKED if not seen else EMPTY if not full else USED
+        for within, seen, full in zip(inside, tracked, filled, strict=True)
+    ]
 
 
 def thin_evenly(points: Floats, spacing_mm: float) -> Floats:

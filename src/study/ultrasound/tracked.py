@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,10 @@ class TrackedSweep:
         T_probe_image: image frame to probe frame; None before calibration.
         latency_s: how late frames are stamped: a frame stamped t shows the world at ``t - latency_s``.
         name: what it is, for messages: ``"us:p3"``.
+        frame_names: names of the probe's and of the base frame, as PLUS calls them in its transforms.
+        frame_fields: what a recording says of its frames beyond all this (other tools' transforms), as text, by the
+            frame's stamp (s); kept for writing. Entries of other stamps are dropped.
+        notes: how the recording was read where there was a choice, a sentence each.
 
     Raises:
         StudyError: shapes that do not belong together, times that fall, rotations that are none.
@@ -46,6 +51,9 @@ class TrackedSweep:
     T_probe_image: RigidTransform | None = None
     latency_s: float = 0.0
     name: str = "sweep"
+    frame_names: tuple[str, str] = ("Probe", "Tracker")
+    frame_fields: Mapping[float, Mapping[str, str]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         f, p = len(self.frame_times_s), len(self.poses)
@@ -62,6 +70,9 @@ class TrackedSweep:
         object.__setattr__(self, "pose_valid", valid)
         self._check_times()
         self._check_poses()
+        stamps = set(self.frame_times_s.tolist())
+        kept = {time: dict(fields) for time, fields in self.frame_fields.items() if time in stamps}
+        object.__setattr__(self, "frame_fields", kept)
         if self.masks is None and self.images is None:
             raise StudyError(f"{self.name}: expected masks or B-mode images, got neither; pass at least one")
         for key in ("masks", "images"):
