@@ -1,6 +1,6 @@
 """Tracked ultrasound (sec. II): calibrations, masks to cloud; the virtual sweep and the sizes of its errors."""
 
-from study.ultrasound.b_mode import b_mode_like, ct_frame, frame_below, frame_of, skin_depth_mm
+from study.ultrasound.b_mode_of_ct import b_mode_like, ct_frame, frame_below, frame_of, skin_depth_mm
 from study.ultrasound.bmode import BONE, CARTILAGE, Echo, simulate_bmode
 from study.ultrasound.bone_surface import BoneFinder, BoneSurface, find_bone_surface, mask_sweep
 from study.ultrasound.cloud import (
