@@ -30,7 +30,7 @@ $(STAMP): environment.lock pyproject.toml tools/setup.sh tools/check_system.py
 
 study: $(STAMP)  ## run the whole study: the notebooks; ends with the finding, the report, the comparison
 	$(BIN)/study notebooks --jobs $(JOBS) --out $(RUNS)/notebooks
-	$(BIN)/study report --html $(RUNS)
+	$(BIN)/study report --html $(RUNS) --jobs $(JOBS)
 	$(BIN)/study compare results/reference $(RUNS)
 
 evidence: $(STAMP)  ## robustness, sensitivity, more people: up to 90 minutes on 2 cores, goes on where it was stopped
