@@ -33,7 +33,7 @@ study: results  ## run the whole study: the notebooks; ends with the finding, th
 
 results: $(STAMP)
 	$(BIN)/study notebooks --jobs $(JOBS) --out $(RUNS)/notebooks
-	$(BIN)/study report --html $(RUNS)
+	$(BIN)/study report --html $(RUNS) --jobs $(JOBS)
 
 evidence: $(STAMP)  ## robustness, sensitivity, more people: up to 90 minutes on 2 cores, goes on where it was stopped
 	$(BIN)/study evidence --out $(EVIDENCE) --jobs $(JOBS)

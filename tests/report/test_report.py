@@ -18,11 +18,13 @@ from study.errors import StudyError
 from study.files.atomic import sha256_of
 from study.report import write_report
 from study.report.assets import ASSETS, VENDORED_SHA256, require_vendored
+from study.report.page import FIGURES
 from study.report.scenes import STEP_MM, VERTICES, coarse_surface
 from study.results.clouds import CLOUDS, Clouds
 from study.results.run import Run
 from study.types import Mesh
 
+ROOT = Path(__file__).parents[2]
 LOADS = {("script", "src"), ("link", "href"), ("img", "src"), ("iframe", "src"), ("source", "src"), ("image", "href")}
 MAX_MB, CASES, CTS = 40, 22 * 23 + 20, 10  # all pairs of the reported data sets, with some to spare
 
@@ -85,6 +87,7 @@ def test_pages_load_nothing_from_a_network_and_their_links_hold(report: Path) ->
 def test_a_notebook_keeps_its_text_and_loses_what_would_be_loaded(report: Path) -> None:
     text = (report / "notebooks" / "10_made up.html").read_text(encoding="utf-8")
     assert "<script" not in text
+    assert "anchor-link" not in text
     assert "cdn.example" not in text
     assert "&lt;b&gt;not bold&lt;/b&gt; $x$" in text
     assert "The map <var>F<sub>k</sub></var> and <var>N<sub>reg</sub></var>" in text
@@ -130,7 +133,7 @@ def test_a_whole_study_stays_small(report: Path) -> None:
     path = report / "data" / "phantom--ct1--patient.js"
     _, pair = script_of(path)
     case = path.stat().st_size / len(pair["methods"]) * VERTICES / (pair["table"]["true"]["n"] / 3)
-    notebooks = sum(path.stat().st_size for path in (ASSETS.parents[3] / "notebooks").glob("*.ipynb"))
+    notebooks = sum(path.stat().st_size for path in (ROOT / "notebooks").glob("*.ipynb"))
     own = sum(path.stat().st_size for path in ASSETS.iterdir() if path.is_file())
     assert notebooks > 1e6
     assert CASES * case + CTS * 1e6 + 1.5 * notebooks + own < MAX_MB * 1e6
@@ -163,6 +166,15 @@ def test_coarse_surface_is_closed_and_its_vertices_are_rows() -> None:
     fine = rings[faces]
     whole = np.linalg.norm(np.cross(fine[:, 1] - fine[:, 0], fine[:, 2] - fine[:, 0]), axis=1).sum() / 2
     assert area == pytest.approx(whole, rel=0.12)
+
+
+def test_every_picture_that_notebooks_keep_is_described() -> None:
+    source = "".join(
+        (ROOT / "notebooks" / name).read_text(encoding="utf-8") for name in ("50_study.py", "60_results.py")
+    )
+    stems = {stem for stem in re.findall(r'drawn(?:\[| = \{)f?"([a-z_{}]+)"', source) if "{" not in stem}
+    assert {"hausdorff", "judges"} <= stems
+    assert stems <= set(FIGURES)
 
 
 # --- what is refused -------------------------------------------------------------------------------------------------

@@ -71,6 +71,7 @@ def _describe_images(notebook: Any) -> None:
 
 def _in_a_page(body: str) -> str:
     """Cells without links to a network's scripts, wide tables that scroll by themselves, and TeX names as text."""
+    body = re.sub(r'<a class="anchor-link"[^>]*></a>', "", body)  # a stop of the keyboard that shows nothing
     body = re.sub(r"<script\b.*?</script>", "", body, flags=re.DOTALL)  # widgets' and MathJax's loaders
     body = re.sub(
         r"(<table\b.*?</table>)",

@@ -27,15 +27,20 @@ from study.results.verdicts import claim_rows, claims_markdown
 FOLDER = "report"
 STATIC = ("viewer.js", "viewer_data.js", "style.css", "niivue.umd.js", "niivue.LICENSE.txt")
 MARK = '<meta name="generator" content="study report">'
-FIGURES = {  # by the stem of a picture: what it shows, for those who do not see it
-    "hausdorff": "Hausdorff distance of every method, pair by pair, beside its mean",
-    "surface_distance": "Distances between the warped CT cloud and the US cloud, by method",
-    "waypoints": "Waypoint errors of every method by the paper's protocol",
-    "judges": "The same waypoints judged by the paper's protocol and by the truth, method by method",
-    "against_hd": "True waypoint error against Hausdorff distance, a point a method",
-    "against_waypoint_error": "True waypoint error against the protocol's waypoint error, a point a method",
-    "protocol_phantom": "The protocol's waypoint error beside the true one, method by method, on phantom",
-    "protocol_planted": "The protocol's waypoint error beside the true one, method by method, on planted",
+FIGURES = {  # by the stem of a picture: what it shows, for those who do not see it; notebooks 50 and 60 draw them
+    "hausdorff": "Hausdorff distance of every method on each pair, beside the paper's means",
+    "surface_distance": "Mean distance between the warped CT cloud and the US cloud, of every method on each pair",
+    "waypoints": "Waypoint errors by the paper's protocol, a dot a waypoint, of every method",
+    "people": "Waypoint errors by the paper's protocol on a typical and the worst pair of real people, of every method",
+    "judges": "The same waypoints judged by the paper's protocol and by the truth where it is known, method by method",
+    "against_hd": "Hausdorff distance of the skeleton graph minus that of every other method, a dot a pair",
+    "against_waypoint_error": "Waypoint error of the skeleton graph minus that of every other method, a dot a pair",
+    "intervals_skeleton_graph": "Mean lead of the skeleton graph on every other method with 95 % intervals over people",
+    "intervals_skeleton_graph_repaired": (
+        "Mean lead of this study's repair of the skeleton graph on every other method with 95 % intervals over people"
+    ),
+    "protocol_phantom": "The protocol's waypoint errors beside the true ones, method by method, on phantom",
+    "protocol_planted": "The protocol's waypoint errors beside the true ones, method by method, on planted",
 }
 
 
