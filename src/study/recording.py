@@ -94,7 +94,7 @@ def cloud_of_recording(
         which = (
             "" if fate == USED else f" (numbers {_ranges([i for i, one in enumerate(masked.fates) if one == fate])})"
         )
-        lines.append(f"frames {fate}: {n} of {len(masked.fates)}{which}")
+        lines.append(f"frames {fate}: {n} of {len(masked.fates)}{'' if fate == USED else f' (numbers {which})'}")
     if counts[USED] < FEW_USED * len(masked.fates):
         lines.append(f"study: warning: only {counts[USED]} of {len(masked.fates)} frames were used; see {report.name}")
     return [
