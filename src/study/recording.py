@@ -91,10 +91,8 @@ def cloud_of_recording(
     front = ",".join(f"{value:.3f}" for value in np.round(made.front, 3) + 0.0)  # no minus before a zero
     lines = [*masked.notes, f"latency {1000 * masked.sweep.latency_s:.0f} ms taken out of the frames' stamps"]
     for fate, n in counts.most_common():
-        which = (
-            "" if fate == USED else f" (numbers {_ranges([i for i, one in enumerate(masked.fates) if one == fate])})"
-        )
-        lines.append(f"frames {fate}: {n} of {len(masked.fates)}{'' if fate == USED else f' (numbers {which})'}")
+        numbers = _ranges([i for i, one in enumerate(masked.fates) if one == fate])
+        lines.append(f"frames {fate}: {n} of {len(masked.fates)}" + ("" if fate == USED else f" (numbers {numbers})"))
     if counts[USED] < FEW_USED * len(masked.fates):
         lines.append(f"study: warning: only {counts[USED]} of {len(masked.fates)} frames were used; see {report.name}")
     return [
