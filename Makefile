@@ -6,6 +6,7 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+LAB_STAMP := $(VENV)/lab-installed
 JOBS ?= 2
 RUNS := results/runs
 EVIDENCE := results/runs/evidence
@@ -16,7 +17,7 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export NUMEXPR_NUM_THREADS := 1
 
-.PHONY: help setup study evidence test check notebooks reference bench lock clean
+.PHONY: help setup study results evidence test check notebooks reference bench lab lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -27,11 +28,12 @@ $(STAMP): environment.lock pyproject.toml tools/setup.sh tools/check_system.py
 	@bash tools/setup.sh $(VENV)
 	@touch $@
 
-study: $(STAMP)  ## run the whole study; prints the tables and where the figures are
-	for dataset in $$($(BIN)/study datasets --reported); do \
-	  $(BIN)/study run --dataset $$dataset --jobs $(JOBS) || exit 1; done
-	$(BIN)/python tools/notebooks.py run --jobs $(JOBS) --out $(RUNS)/notebooks
-	$(BIN)/study report $(RUNS)
+study: results  ## run the whole study: the notebooks; ends with the finding, the report, the comparison
+	$(BIN)/study compare results/reference $(RUNS)
+
+results: $(STAMP)
+	$(BIN)/study notebooks --jobs $(JOBS) --out $(RUNS)/notebooks
+	$(BIN)/study report --html $(RUNS)
 
 evidence: $(STAMP)  ## robustness, sensitivity, more people: up to 90 minutes on 2 cores, goes on where it was stopped
 	$(BIN)/study evidence --out $(EVIDENCE) --jobs $(JOBS)
@@ -51,7 +53,7 @@ check: $(STAMP)  ## ruff, types, import layers, notebook pairing
 notebooks: $(STAMP)  ## execute the notebooks in place, outputs kept
 	$(BIN)/python tools/notebooks.py write --jobs $(JOBS)
 
-reference: study  ## run the study, renew results/reference and results/evidence, draft the CHANGELOG rows
+reference: results  ## run the study, renew results/reference and results/evidence, draft the CHANGELOG rows
 	$(BIN)/python tools/reference.py --runs $(RUNS)
 	for part in robustness sensitivity people; do if [ -d $(EVIDENCE)/$$part ]; then \
 	  mkdir -p results/evidence && rm -rf results/evidence/$$part && cp -r $(EVIDENCE)/$$part results/evidence/$$part; \
@@ -63,7 +65,14 @@ reference: study  ## run the study, renew results/reference and results/evidence
 bench: $(STAMP)  ## ratios and rates quoted in the README
 	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
-lock: $(STAMP)  ## renew environment.lock from pyproject.toml
+lab: $(LAB_STAMP)  ## open the notebooks in JupyterLab, each paired with its script while it is edited
+	$(BIN)/jupyter lab --ServerApp.root_dir=$(CURDIR) --LabApp.default_url=/lab/tree/notebooks/00_data.ipynb
+
+$(LAB_STAMP): $(STAMP) environment-lab.lock
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --require-hashes -r environment-lab.lock
+	@touch $@
+
+lock: $(STAMP)  ## renew environment.lock and environment-lab.lock from pyproject.toml
 	bash tools/lock.sh
 
 clean:  ## remove the environment and the runs, keep downloads

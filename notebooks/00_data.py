@@ -1,6 +1,8 @@
 # %% [markdown]
 # # Who is in this study, and which of them are real?
 #
+# *To run this: `make lab` opens JupyterLab on these notebooks; in VS Code, `make setup` and the kernel `.venv`.*
+#
 # The paper takes five chest CTs from RibSeg and the ultrasound of one volunteer. The CTs are public but large, the
 # ultrasound is not. So the study has two cohorts that any machine can have in minutes: `open`, real CTs out of package
 # archives, and `phantom`, synthetic people whose deformation into each other is known exactly. `planted` is in between:

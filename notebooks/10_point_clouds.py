@@ -20,7 +20,8 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from study import ct, datasets, figures, geometry, params
+from study import ct, datasets, figures, geometry, params, seeds, ultrasound
+from study.types import CARTILAGES, Part
 
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
@@ -49,7 +50,8 @@ print(f"{len(people)} of {len(names)} subjects: {', '.join(people)}")
 
 # %% [markdown]
 # ## Slice, surface, cloud
-# For one subject of each kind. In the slices every outline should follow the edge of a cartilage, which is only a
+# For one subject of each kind. Cartilages curve, so a flat cut loses them; here the front of the chest is unrolled: the
+# mean density of the sheet in front of the lungs. Every outline should follow the edge of a cartilage, which is only a
 # little brighter than the muscle around it, and end where the rib begins. The surface should have no bridges between
 # ribs. The cloud is the surface sampled evenly (Poisson discs), so that the density of points tells the registration
 # nothing.
@@ -60,26 +62,55 @@ shown = dict.fromkeys([*reversed(one_of_each.values()), *people])
 examples = [people[name] for name in list(shown)[:2]]
 
 
-def slices(one):
-    """A subject's parts on its CT, under the subject's name."""
-    return figures.ct_slice(replace(one.image, name=one.name), ct.on_grid(one.mask, one.image))
-
-
+walls = {one.name: ct.anterior_wall_image(one.image) for one in examples}
+fronts = {name: figures.FrontWall(wall.image, wall.x_mm, wall.z_mm, name) for name, wall in walls.items()}
 print(" and ".join(f"{one.name}, cut by {cuts[one.name].by}" for one in examples))
-slices(examples[0])
+figures.front_wall(fronts[examples[0].name], examples[0].mask)
 
 # %%
 figures.mesh_and_cloud(examples[0].mesh, examples[0].cloud)
 
 # %% [markdown]
-# The same for another subject: one cut in the other way, where there is one. Cut by landmarks, a cartilage is grown on
-# a grid of its own, here laid over the voxels of the CT.
+# The same for another subject: one cut in the other way, where there is one.
 
 # %%
-slices(examples[-1])
+figures.front_wall(fronts[examples[-1].name], examples[-1].mask)
 
 # %%
 figures.mesh_and_cloud(examples[-1].mesh, examples[-1].cloud)
+
+# %% [markdown]
+# ## The biomarker
+# The paper's Fig. 1: bone and cartilage of one rib meet in a junction that both CT and ultrasound show, and it bounds
+# the region of interest. On CT bone is bright and cartilage grey. Ultrasound passes cartilage, so the line of the
+# pleura goes on beneath it, while a rib is a bright line with a shadow. The two frames look like B-mode and are
+# simulated from this CT; nothing else in the study uses them.
+
+# %%
+first, wall = examples[0], walls[examples[0].name]
+
+
+def on_both(part):
+    """A place in the middle of a cartilage, and one on its rib, 20 mm beyond the junction."""
+    branch, side = first.cloud.only(part), 1 if part.side == "right" else -1
+    junction = branch[np.argmax(side * branch[:, 0])]
+    beyond = wall.x_mm[np.abs(wall.x_mm - junction[0] - 20.0 * side).argmin()]
+    near = np.flatnonzero(np.abs(wall.z_mm - junction[2]) < 15.0)
+    on_rib = wall.z_mm[near[wall.image[near, wall.x_mm == beyond].argmax()]]
+    return {"cartilage": branch.mean(axis=0), "rib": wall.pick(beyond, on_rib)}
+
+
+def rib_depth_mm(places):
+    """How deep its rib lies."""
+    return ultrasound.skin_depth_mm(first.image, places["rib"])
+
+
+# %%
+places = min(map(on_both, CARTILAGES), key=rib_depth_mm)  # where the rib lies least deep
+places["cartilage"] = on_both(Part.RIGHT_4)["cartilage"]  # one that is not calcified
+probe, rng = ultrasound.Probe(), seeds.named_rng(seed, "b-mode")
+frames = {what: ultrasound.frame_below(first.image, first.mask, place, probe, rng) for what, place in places.items()}
+figures.biomarker(fronts[first.name], first.mask, frames, (probe.aperture_mm, probe.depth_mm))
 
 # %% [markdown]
 # ## Points and their spacing

@@ -8,7 +8,7 @@
 #
 # **Everything here is simulated.** No tracked sweep over cartilage is public, so a virtual probe scans a surface that
 # we know: that of a synthetic person (`phantom`), of a real CT (`open`) or of a real CT under a known deformation
-# (`planted`). The code that makes the cloud does not know that; a real sweep takes the same road (see the README).
+# (`planted`). The code that makes the cloud does not know that; a real sweep takes the same road (see `docs/use.md`).
 
 # %% tags=["parameters"]
 dataset = "phantom"  # phantom, open or planted
@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from study import datasets, evaluation, figures, params, seeds, ultrasound
+from study.types import RigidTransform
 
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
@@ -86,7 +87,9 @@ pd.DataFrame(
 # %% [markdown]
 # ## One frame
 # What the probe meets first under each of its columns, as an annotator would draw it: a thin line along the upper
-# surface. There is no B-mode picture behind it; speckle is not simulated, because only the line goes on.
+# surface. The picture behind it looks like B-mode and is simulated from the CT in the plane of the frame, to show what
+# an annotator would look at: cartilage dark between its upper surface and the pleura, bone with a shadow. Only the
+# line goes on. This frame is of a sweep without errors. A planted deformation has no CT of its own, so no picture.
 
 # %%
 source, target = data.pairs()[0]
@@ -101,10 +104,19 @@ def sweep_with(errors, repeat=None):
 
 
 sweep = sweep_with(ultrasound.SweepErrors())
-fullest = int(sweep.masks.any(axis=1).sum(axis=1).argmax())
-figures.frame_with_mask(
-    sweep.masks[fullest], sweep.pixel_spacing_mm, title=f"mask of frame {fullest} of {sweep.n_frames} (simulated)"
-)
+clean = sweep_with(ultrasound.SweepErrors.none())  # else picture and line would not lie over each other
+poses, _, tracked = clean.frame_poses()
+fullest = int((clean.masks.any(axis=1).sum(axis=1) * tracked).argmax())
+picture = None
+if patient.anatomy.image is not None:
+    T_us_image = RigidTransform.from_matrix(poses[fullest]) @ clean.T_probe_image
+    plane = patient.T_us_ras.inverse @ T_us_image
+    shape, speckle = clean.masks.shape[1:], seeds.named_rng(seed, "us/speckle")
+    picture = ultrasound.frame_of(
+        patient.anatomy.image, patient.anatomy.mask, plane, shape, clean.pixel_spacing_mm[0], speckle
+    )
+title = f"frame {fullest} of {clean.n_frames}{', B-mode-like' * (picture is not None)}, simulated"
+figures.frame_with_mask(clean.masks[fullest], clean.pixel_spacing_mm, picture, title)
 
 # %% [markdown]
 # ## The sweep in space
@@ -168,9 +180,9 @@ pd.DataFrame(ultrasound.error_table()).set_index(["source", "field"])
 # ## What each error costs
 # Each row of the figure is one source alone; the last two are all together. Left: how far the cloud lies from the
 # surface that a probe can see. Right: how far the 20 waypoints, carried from one CT, end from where they are defined on
-# the patient, after a whole registration, coarse alignment included, in the feature plane, by method: the four as
-# published or shipped, and tuned on the visible surface. Small dots are single sweeps of the same patient, and every
-# row of one sweep shares its random draws.
+# the patient, after a whole registration, coarse alignment included, in the feature plane; a panel a method, as
+# published or shipped and tuned on the visible surface. A line spans the sweeps of the same patient, and every row of
+# one sweep shares its random draws.
 # Where the coarse alignment refuses a cloud (the reasons follow below), the methods are started by hand: from the
 # alignment of the sweep without errors, with the true parts as labels, so that the row still says what the error costs.
 
@@ -190,7 +202,7 @@ budget = evaluation.error_budget(
 in_plane = budget.rows[budget.rows["metric"] != "waypoint_error"].replace(
     {"metric": {"waypoint_error_inplane": "waypoint_error"}}
 )
-figures.error_budget(in_plane, note=f"{figures.SIMULATED}; waypoints in the feature plane")
+figures.error_budget(in_plane, note=f"by the paper's protocol, in the feature plane; {figures.SIMULATED}")
 
 # %% [markdown]
 # What the errors do to the cloud. The distance of a cloud to a surface hides a shift along that surface, so `points

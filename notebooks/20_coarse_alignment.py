@@ -88,6 +88,32 @@ def view(chest):
 figures.coarse_steps({name: view(chest) for name, chest in chests.items()})
 
 # %% [markdown]
+# The same match as a map, as in the paper's Fig. 2: $F_k$ of Eq. 1 at the rotation found, the template's centre at each
+# pixel, and the largest $F_k$ at every rotation of the first search. A flat top means that many places or rotations
+# would do as well, which is why the sides and the arch decide later.
+
+
+# %%
+def scored(chest):
+    """The first search's scores, and the rectangle it found."""
+    search = chest.search
+    coarse = search.fit.searches[0]
+    scores = alignment.sternum_scores(search.plane, coarse)
+    return figures.ScoreView(
+        values=scores.values,
+        origin=scores.origin,
+        pixel_mm=scores.pixel_mm,
+        angles_deg=scores.angles_deg,
+        best=scores.best,
+        plane=search.plane,
+        centre=coarse.centre,
+        angle_deg=coarse.angle_deg,
+    )
+
+
+figures.score_maps({name: scored(chest) for name, chest in chests.items()})
+
+# %% [markdown]
 # How clear each decision was. `covered` is $F_k$ of Eq. 1 over the area of the rectangle, at each scale; a `bend ratio`
 # of 1 or an `arch` of 0 would be a coin toss between foot and head, or front and back.
 

@@ -20,6 +20,7 @@ seed = 0
 import numpy as np
 import pandas as pd
 from IPython.display import Markdown, display
+from tqdm import tqdm
 
 from study import datasets, evaluation, figures, params, pipeline
 from study.types import Part
@@ -142,7 +143,7 @@ moves.round(1)
 
 # %%
 options = evaluation.options(method, data.params.radius_mm)
-changed = evaluation.changes(evaluation.ablate(pairs, options, seed))
+changed = evaluation.changes(evaluation.ablate(pairs, tqdm(options, "choices"), seed))
 by_protocol, by_truth = (
     changed[changed["judge"] == judge] for judge in (evaluation.PROTOCOL, evaluation.TRUE_IN_PLANE)
 )

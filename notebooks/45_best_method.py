@@ -18,6 +18,7 @@ seed = 0
 import numpy as np
 import pandas as pd
 from IPython.display import Markdown, display
+from tqdm import tqdm
 
 from study import batch, datasets, evaluation, figures, methods, params, pipeline
 
@@ -28,7 +29,7 @@ pd.options.display.max_colwidth = None
 sources, targets = (dict.fromkeys(names) for names in zip(*data.pairs(), strict=True))
 patients = {name: data.patient(name) for name in targets}
 people = {name: data.anatomy(name) for name in sources}
-pairs = [data.pair(people[source], patients[target]) for source, target in data.pairs()]
+pairs = [data.pair(people[source], patients[target]) for source, target in tqdm(data.pairs(), "pairs")]
 
 # %% [markdown]
 # ## One change at a time
@@ -38,7 +39,7 @@ pairs = [data.pair(people[source], patients[target]) for source, target in data.
 # calibration and speed of sound taken out, which no method can see.
 
 # %%
-walked = evaluation.walk(pairs, evaluation.way_to_best(), seed)
+walked = evaluation.walk(pairs, tqdm(evaluation.way_to_best(), "steps"), seed)
 errors = [name for name in ("true", "in_plane", "registered") if name in walked]
 titles = {"true": "true error", "in_plane": "true, in plane", "registered": "as registered"}
 steps = walked.groupby(["role", "change"], sort=False)[errors].mean().rename(columns=titles)
@@ -61,7 +62,7 @@ steps.loc[evaluation.LEFT_OUT].rename_axis("left out").round(2)
 # visible surface, and a smooth field through the nodes. `bcpd` is a modern rival, Bayesian coherent point drift.
 
 # %%
-run = batch.open_run(dataset, profile, seed)
+run = batch.open_run(dataset, profile, seed, show_progress=True)
 by_truth = ["true_waypoint_error", "true_waypoint_error_inplane", "registered_waypoint_error"]
 found = {evaluation.METRICS[name].title: evaluation.mean_intervals(run.per_pair.loc[name]) for name in by_truth}
 table = pd.DataFrame({title: rows.apply(evaluation.interval_text, axis=1) for title, rows in found.items()})

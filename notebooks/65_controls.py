@@ -16,6 +16,7 @@ seed = 0
 # %%
 import pandas as pd
 from IPython.display import display
+from tqdm import tqdm
 
 from study import batch, datasets, evaluation, figures, params, ultrasound
 
@@ -23,7 +24,7 @@ params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
 pd.options.display.max_colwidth = None
 MOST_PAIRS = {"full": 3, "quick": 1}[profile]
-run = batch.open_run(dataset, profile, seed)
+run = batch.open_run(dataset, profile, seed, show_progress=True)
 run.overview().to_frame()
 
 # %% [markdown]
@@ -38,7 +39,7 @@ none = ultrasound.SweepErrors.none()
 todo = data.pairs()[:MOST_PAIRS]
 people = {name: data.anatomy(name) for name in dict.fromkeys(name for pair in todo for name in pair)}
 pairs, floors = [], []
-for source, target in todo:
+for source, target in tqdm(todo, "pairs"):
     seen, clean = (data.patient(target, people[target], errors) for errors in (None, none))
     again = datasets.make_patient(people[target], data.params, seed, none, 1)
     second = again.labelled.moved(clean.T_us_ras @ again.T_us_ras.inverse)

@@ -81,7 +81,7 @@ methods_only = {name: table.drop(columns=TRUTH, errors="ignore") for name, table
 known = {name: table for name, table in methods_only.items() if TRUTH in per_pair[name]}
 for metric, tables in (("waypoint_error", methods_only), ("true_waypoint_error", known)):
     differences = evaluation.differences(tables, metric)
-    display(figures.paired_differences(differences, GRAPH, METRICS[metric].title))
+    display(figures.paired_differences(differences, GRAPH, metric))
 
 # %% [markdown]
 # ## Worse clouds
@@ -113,7 +113,7 @@ counts[counts[["by_hand", "failed"]].any(axis=1)].rename(columns={"by_hand": "re
 
 # %%
 choices = evidence.table("sensitivity")
-figures.choices(choices)
+display(*(figures.choices(choices, page) for page in figures.choice_pages(choices)))
 
 # %% [markdown]
 # ### What tears the cloud, and what mends it

@@ -89,8 +89,8 @@ def refused(capsys: Capture, *arguments: str | Path) -> str:
 
 @pytest.mark.parametrize(
     "words",
-    [[], ["data"], ["run"], ["compare"], ["register"], ["cloud"], ["report"], ["datasets"], ["evidence"],
-     ["data", "list"], ["data", "fetch"], ["data", "verify"]],
+    [[], ["data"], ["run"], ["compare"], ["rerun"], ["register"], ["cloud"], ["report"], ["datasets"], ["evidence"],
+     ["landmarks"], ["data", "init"], ["data", "list"], ["data", "fetch"], ["data", "verify"]],
     ids=" ".join,
 )  # fmt: skip
 def test_every_command_explains_itself(words: list[str], capsys: Capture) -> None:
@@ -209,8 +209,11 @@ def test_two_clouds_are_registered_and_written(clouds: Path, tmp_path: Path, cap
     assert main([*words, "--method", "icp", "--out", "out"]) == 0
     out, _ = capsys.readouterr()
     written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written == {"warped.ply", "registration.json", "waypoints_us.csv"}
+    made = {"warped.ply", "registration.json", "rigid.tfm"}
+    assert written == made | {"waypoints_us.csv", "waypoints_us.mrk.json", "waypoints_robot.json"}
     assert all(name in out for name in written)
+    assert "not for a probe to follow" in out
+    assert "no comment SPACE=" not in out
     ct, us, warped = (read_ply(path) for path in (clouds / "ct.ply", clouds / "us.ply", tmp_path / "out/warped.ply"))
     T = np.array(json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))["T_us_ct"])
     assert np.allclose(ct @ T[:3, :3].T + T[:3, 3], warped, atol=1e-9)  # ICP is rigid: row i is CT point i
@@ -268,7 +271,7 @@ def test_front_radius_quality_and_warnings(clouds: Path, tmp_path: Path, capsys:
     assert all(f"study: warning: {one}" in said for one in summary["warnings"])
     line = refused(capsys, *words[:-1], "back", "--front", "0,-1,0")
     assert "us: expected cartilages that arch towards the `front` given" in line
-    assert "expected three numbers" in refused(capsys, *words[:-1], "back", "--front", "up")
+    assert "expected 3 numbers" in refused(capsys, *words[:-1], "back", "--front", "up")
     assert "--radius" in refused(capsys, *words[:-1], "back", "--radius", "-3")
     assert not (tmp_path / "back").exists()
 
@@ -281,6 +284,37 @@ def test_a_waypoint_far_off_is_named_and_the_others_are_carried(clouds: Path, tm
     assert "waypoint not carried: line 3: expected at least 3 CT points" in capsys.readouterr().err
     rows = (tmp_path / "out" / "waypoints_us.csv").read_text(encoding="utf-8").splitlines()
     assert [row.startswith(",,,") for row in rows] == [False, False, True, False]
+
+
+def test_files_of_slicer_and_a_field_go_through(clouds: Path, tmp_path: Path, capsys: Capture) -> None:
+    """The same clouds and waypoints as 3D Slicer keeps them, in LPS, give the same result."""
+    turned = [-1.0, -1.0, 1.0]
+    for name in ("ct", "us"):
+        path = write_ply(PointCloud(read_ply(clouds / f"{name}.ply") * turned), tmp_path / f"{name}.ply")
+        path.write_bytes(path.read_bytes().replace(b"SPACE=RAS", b"SPACE=LPS"))
+    places = np.loadtxt(clouds / "way.csv", delimiter=",", skiprows=1)
+    points = [{"label": f"W{k}", "position": (place * turned).tolist()} for k, place in enumerate(places)]
+    markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+    (tmp_path / "w.mrk.json").write_text(json.dumps({"markups": [markup]}), encoding="utf-8")
+    rest = ["--method", "coarse", "--out"]
+    assert main(["register", "ct.ply", "us.ply", "--waypoints", "w.mrk.json", "--field", "8", *rest, "lps"]) == 0
+    ras = [str(clouds / name) for name in ("ct.ply", "us.ply", "way.csv")]
+    assert main(["register", *ras[:2], "--waypoints", ras[2], *rest, "ras"]) == 0
+    capsys.readouterr()
+    assert np.allclose(read_ply("lps/warped.ply"), read_ply("ras/warped.ply"), atol=1e-6)
+    assert Path("lps/displacement.nii.gz").is_file()
+    summary = json.loads(Path("lps/registration.json").read_text(encoding="utf-8"))
+    assert (summary["inputs"]["us"]["space"], summary["inputs"]["waypoints"]["space"]) == ("LPS", "LPS")
+    assert summary["inputs"]["ct"]["sha256"] == sha256_of(tmp_path / "ct.ply")
+    assert summary["field"]["return_mm"]["max"] < 0.01  # coarse moves rigidly
+    us = json.loads(Path("lps/waypoints_us.mrk.json").read_text(encoding="utf-8"))["markups"][0]
+    assert us["coordinateSystem"] == "LPS"
+    in_ras = np.loadtxt("ras/waypoints_us.csv", delimiter=",", skiprows=1)
+    assert np.allclose([one["position"] for one in us["controlPoints"]], in_ras * turned, atol=1e-6)
+    (tmp_path / "w.mrk.json").write_text(json.dumps({"markups": [markup]})[:-9], encoding="utf-8")
+    line = refused(capsys, "register", "ct.ply", "us.ply", "--waypoints", "w.mrk.json", *rest, "no")
+    assert "w.mrk.json: expected JSON" in line
+    assert not (tmp_path / "no").exists()
 
 
 @pytest.mark.parametrize("fault", ["nan", "metres", "five", "garbage", "flat", "waypoint", "method", "columns"])

@@ -282,6 +282,10 @@ def test_a_front_is_heeded_and_one_the_branches_contradict_refused(ct_clouds, us
     ct, us = ct_clouds["ct1"].points, us_cloud.points
     with_front = register_pair(ct, us, "coarse", front=[0, 2.0, 0])
     assert np.array_equal(with_front.warped, register_pair(ct, us, "coarse").warped)
+    assert with_front.front @ [0, 1, 0] > 0.8  # of the US cloud's chest, whose skin lies there
+    right = ct[np.isin(with_front.parts, [1, 2, 3, 4])]  # RAS: the patient's right has the larger x
+    assert len(with_front.parts) == len(ct)
+    assert right[:, 0].mean() > ct[:, 0].mean() + 20
     handed_on = register_pair(ct, PointCloud(us, front=np.array([0, 1.0, 0])), "coarse")
     assert np.array_equal(with_front.warped, handed_on.warped)
     with pytest.raises(StudyError, match="us: expected cartilages that arch towards the `front` given"):

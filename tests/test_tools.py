@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
-import jupytext
 import nbformat
 import pandas as pd
 import pytest
@@ -90,27 +89,18 @@ def notebooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = load("notebooks")
     monkeypatch.setattr(module, "NOTEBOOKS", tmp_path)
     (tmp_path / "00_sum.py").write_text(SOURCE)
-    notebook = jupytext.reads(SOURCE, fmt="py:percent")
+    notebook = module.tidied(module.Notebook(tmp_path / "00_sum.py").blank())
     notebook.cells[-1].outputs = [nbformat.v4.new_output("stream", name="stdout", text="2\n")]
     nbformat.write(notebook, tmp_path / "00_sum.ipynb")
     return module
 
 
 def test_a_pair_that_agrees_passes(notebooks: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    assert notebooks.check() == 0
+    assert notebooks.main(["check"]) == 0
     assert capsys.readouterr().out == "1 notebook pairs agree\n"
 
 
-def test_papermills_own_cell_is_no_difference(notebooks: ModuleType) -> None:
-    path = notebooks.NOTEBOOKS / "00_sum.ipynb"
-    notebook = nbformat.read(path, as_version=4)
-    cell = nbformat.v4.new_code_cell("a = 3", metadata={"tags": ["injected-parameters"]})
-    notebook.cells.insert(2, cell)
-    nbformat.write(notebook, path)
-    assert notebooks.check() == 0
-
-
-@pytest.mark.parametrize("fault", ["code", "outputs", "size", "absent", "orphan"])
+@pytest.mark.parametrize("fault", ["code", "words", "outputs", "size", "injected", "stderr", "absent", "orphan"])
 def test_each_fault_fails_and_names_its_notebook(
     notebooks: ModuleType, capsys: pytest.CaptureFixture[str], fault: str
 ) -> None:
@@ -119,64 +109,60 @@ def test_each_fault_fails_and_names_its_notebook(
     notebook = nbformat.read(path, as_version=4)
     if fault == "code":
         (folder / "00_sum.py").write_text(SOURCE.replace("a + 1", "a + 2"))
-    elif fault == "outputs":
-        notebook.cells[-1].outputs = []
-        nbformat.write(notebook, path)
-    elif fault == "size":
-        notebook.cells[-1].outputs[0].text = "2" * notebooks.MAX_BYTES
-        nbformat.write(notebook, path)
+    elif fault == "words":
+        (folder / "00_sum.py").write_text(SOURCE.replace("one and one", "one and two"))
     elif fault == "absent":
         path.unlink()
-    else:
+    elif fault == "orphan":
         nbformat.write(notebook, folder / "01_left_over.ipynb")
-    assert notebooks.check() == 1
+    else:
+        if fault == "outputs":
+            notebook.cells[-1].outputs = []
+        elif fault == "size":
+            notebook.cells[-1].outputs[0].text = "2" * notebooks.MAX_BYTES
+        elif fault == "stderr":
+            notebook.cells[-1].outputs.append(nbformat.v4.new_output("stream", name="stderr", text="|###  |"))
+        else:
+            cell = nbformat.v4.new_code_cell("a = 3", metadata={"tags": ["injected-parameters"]})
+            notebook.cells.insert(2, cell)
+        nbformat.write(notebook, path)
+    assert notebooks.main(["check"]) == 1
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 1
     named = {"absent": "00_sum.py", "orphan": "01_left_over.ipynb"}.get(fault, "00_sum.ipynb")
     assert said[0].startswith(f"{named}: ")
+    if fault in ("injected", "stderr"):
+        assert notebooks.main(["tidy"]) == notebooks.main(["check"]) == 0
 
 
-def test_no_notebooks_at_all_is_a_failure_not_a_pass(notebooks: ModuleType) -> None:
+def test_no_notebooks_at_all_is_a_failure_not_a_pass(notebooks: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     (notebooks.NOTEBOOKS / "00_sum.py").unlink()
-    with pytest.raises(SystemExit, match="got none"):
-        notebooks.check()
+    with pytest.raises(SystemExit, match="2"):
+        notebooks.main(["check"])
+    assert "expected notebooks, got none" in capsys.readouterr().err
 
 
-def test_unknown_parameters_are_refused_before_anything_runs(notebooks: ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"00_sum\.py: expected parameters among a, got b"):
-        notebooks.execute(tmp_path / "00_sum.py", tmp_path / "out.ipynb", {"b": 2})
-    assert not (tmp_path / "out.ipynb").exists()
-
-
-def test_a_failed_notebook_is_named_kept_as_far_as_it_came_and_takes_no_other_down(
+def test_a_failure_in_place_does_not_cost_the_notebook_that_stands(
     notebooks: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    start = SOURCE.replace("a = 1", 'profile = "full"').replace("print(a + 1)", "print(40)")
-    (tmp_path / "10_fails.py").write_text(f"{start}\n# %%\n\n1 / 0\n\n# %%\nprint(41)\n")
-    (tmp_path / "60_reads.py").write_text(start)
-    out = tmp_path / "out"
-    assert notebooks.main(["run", "--out", str(out), "--profile", "quick"]) == 1
-    shown, said = capsys.readouterr()
-    assert "notebook 3 of 3: 60_reads" in shown
-    assert said.splitlines() == [
-        "notebooks: 00_sum: SystemExit: 00_sum.py: expected parameters among a, got profile",
-        "notebooks: 10_fails: cell In [4] ('1 / 0'): ZeroDivisionError: division by zero; "
-        f"kept as far as it came: {out / '10_fails.ipynb'}",
-    ]
-    printed = {
-        path.stem: [o.text for c in nbformat.read(path, 4).cells for o in c.get("outputs", []) if "text" in o]
-        for path in out.glob("*.ipynb")
-    }
-    assert printed == {"10_fails": ["40\n"], "60_reads": ["40\n"]}
-
-
-def test_a_failure_in_place_does_not_cost_the_notebook_that_stands(notebooks: ModuleType, tmp_path: Path) -> None:
     pair = tmp_path / "00_sum.ipynb"
     before = pair.read_bytes()
-    (tmp_path / "00_sum.py").write_text(SOURCE.replace("a = 1", 'profile = "full"').replace("a + 1", "1 / 0"))
+    (tmp_path / "00_sum.py").write_text(SOURCE.replace("a + 1", "1 / 0"))
     assert notebooks.main(["write"]) == 1
     assert pair.read_bytes() == before
-    assert "ZeroDivisionError" in (tmp_path / "00_sum.failed.ipynb").read_text(encoding="utf-8")
+    failed = tmp_path / "00_sum.failed.ipynb"
+    assert "ZeroDivisionError" in failed.read_text(encoding="utf-8")
+    assert "00_sum: cell In [2] ('print(1 / 0)'): ZeroDivisionError" in capsys.readouterr().err
+    (tmp_path / "00_sum.py").write_text(SOURCE.replace("a + 1", "a + 2"))
+    assert notebooks.main(["write"]) == notebooks.main(["check"]) == 0
+    assert not failed.exists()
+
+
+def test_unknown_parameters_are_refused_before_anything_runs(
+    notebooks: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert notebooks.main(["write", "--profile", "quick"]) == 1
+    assert "00_sum: 00_sum.py: expected parameters among a, got profile" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["61", "sum", ""])

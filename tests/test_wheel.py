@@ -85,7 +85,10 @@ def test_wheel_carries_every_module_the_shipped_files_and_no_tests(wheel: Path) 
         names = set(archive.namelist())
         for path in shipped:
             assert archive.read(f"study/shipped/{path.relative_to(ROOT).as_posix()}") == path.read_bytes()
-    assert {*modules, "study/py.typed"} <= names
+    assets = {path.relative_to(ROOT / "src").as_posix() for path in (ROOT / "src/study/report/assets").iterdir()}
+    assets = {name for name in assets if not name.endswith("__pycache__")}
+    assert "study/report/assets/niivue.umd.js" in assets
+    assert {*modules, *assets, "study/py.typed"} <= names
     assert {name.split("/")[0] for name in names} == {"study", f"{DISTRIBUTION}-{__version__}.dist-info"}
     assert not [name for name in names if re.search(r"(^|/)(tests?|test_[^/]*|conftest)(/|\.)", name)]
 

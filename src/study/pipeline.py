@@ -90,9 +90,12 @@ def register_pair(
     given, seen = _as_cloud(ct, "ct"), _as_cloud(us, "us", front, times)
     alignment = Alignment(_even_chest(given), _even_chest(seen))
     result = register_aligned(alignment, chosen, named_rng(seed, f"ct/us/{method}"), method)
+    result = replace(result, target=seen.points)
     if len(alignment.source.cloud) == len(given):
         return result
-    return replace(result, source=given.points, warped=result.carry(given.points, CARRIERS))
+    _, like = nearest(given.points, result.source)
+    parts = None if result.parts is None else result.parts[like]
+    return replace(result, source=given.points, warped=result.carry(given.points, CARRIERS), parts=parts)
 
 
 def _as_cloud(
@@ -178,6 +181,9 @@ def register_aligned(
         quality=quality,
         warnings=(*suspect, *result.warnings, *quality_warnings(quality)),
         converged=result.converged and quality.wrong_part_share <= QUALITY_LIMITS[SWAPPED][0],
+        parts=source.parts,
+        front=alignment.target.T_cloud_chest.rotation[:, 2],
+        target=alignment.target.cloud.points,
     )
 
 

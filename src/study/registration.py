@@ -13,7 +13,7 @@ from study import preview
 from study.errors import StudyError
 from study.geometry.points import fit_rigid, fit_rigid_batch, nearest
 from study.quality import Quality
-from study.types import Floats, PointCloud, RigidTransform, as_points
+from study.types import Floats, Ints, PointCloud, RigidTransform, as_points
 
 MIN_SUPPORT = 3  # points that hold a rigid motion
 MIN_WIDTH_MM = 1e-6  # second singular value of points that lie on a line but for rounding
@@ -150,6 +150,9 @@ class Registration:
         method: the name it ran under.
         warnings: sentences, each on one thing that makes the answer suspect; empty when nothing does.
         quality: measures of the result that need no truth; `study.pipeline.register_aligned` sets both.
+        parts: (n,) `Part` of each CT point, as the coarse alignment named it; it sets this, and
+        front: (3,) unit vector from the chest to the skin in the US frame, and
+        target: (m, 3) mm, the US points as given; None of a method that ran by itself.
 
     A notebook shows one as a few lines and a picture. Its verb is path transfer:
 
@@ -173,6 +176,9 @@ class Registration:
     method: str = ""
     warnings: tuple[str, ...] = ()
     quality: Quality | None = None
+    parts: Ints | None = None
+    front: Floats | None = None
+    target: Floats | None = None
 
     def transfer(self, waypoints: ArrayLike, radius_mm: float = 20.0) -> Floats:
         """`carry_path` of waypoints that must all be good: (k, 3) mm in the US frame.

@@ -6,7 +6,14 @@ from scipy.ndimage import gaussian_filter
 from scipy.signal import correlate
 
 from study.alignment import sternum
-from study.alignment.sternum import SternumParams, feature_plane, rectangle_mask, sternum_candidates, symmetry_axis
+from study.alignment.sternum import (
+    SternumParams,
+    feature_plane,
+    rectangle_mask,
+    sternum_candidates,
+    sternum_scores,
+    symmetry_axis,
+)
 from study.errors import StudyError
 from study.geometry.points import close_gaps, pixelise, sample_spacing_mm
 from study.types import PointCloud, RigidTransform
@@ -146,3 +153,14 @@ def test_what_spreads_over_no_plane_is_refused():
     for points in (rng.normal(scale=40, size=(500, 3)), rng.normal(size=(500, 3)) * [60, 2, 1]):
         with pytest.raises(StudyError, match="expected a chest wall spread over a plane, got principal spreads"):
             feature_plane(PointCloud(points))
+
+
+def test_the_map_of_scores_peaks_where_the_search_found_the_sternum():
+    points = np.random.default_rng(0).uniform([-15, -45], [15, 45], (4000, 2))
+    fit = next(iter(sternum_candidates(points)))
+    scores = sternum_scores(points, fit)
+    peak = np.unravel_index(scores.values.argmax(), scores.values.shape) * np.array(scores.pixel_mm) + scores.origin
+    assert np.linalg.norm(peak - fit.searches[0].centre) <= 2 * scores.pixel_mm
+    assert scores.values.max() == pytest.approx(fit.searches[0].overlap)
+    assert scores.best.max() == pytest.approx(scores.values.max())
+    assert scores.best[scores.angles_deg == fit.searches[0].angle_deg] == scores.best.max()

@@ -61,6 +61,7 @@ def test_neither_workers_nor_order_change_a_byte(first: Path, tmp_path: Path) ->
     assert set(metrics["status"]) <= {"ok", "not converged"}
     assert (tmp_path / "metrics.csv").read_bytes() == (first / "metrics.csv").read_bytes()
     assert (tmp_path / "hd_table.md").read_bytes() == (first / "hd_table.md").read_bytes()
+    assert (tmp_path / "clouds.npz").read_bytes() == (first / "clouds.npz").read_bytes()
 
 
 def test_one_method_alone_has_the_rows_it_has_among_others(first: Path) -> None:
@@ -90,7 +91,7 @@ def test_another_seed_gives_other_numbers(first: Path) -> None:
 
 def test_a_run_leaves_tables_times_and_provenance(first: Path) -> None:
     assert {path.name for path in first.iterdir()} == {
-        "metrics.csv", "timings.csv", "provenance.json", "hd_table.csv", "hd_table.md", "hd_table.tex",
+        "metrics.csv", "timings.csv", "provenance.json", "clouds.npz", "hd_table.csv", "hd_table.md", "hd_table.tex",
         "parameters.json", "manifest.yaml", "environment.lock", "ro-crate-metadata.json",
     }  # fmt: skip
     assert " n " in (first / "hd_table.md").read_text(encoding="utf-8")
@@ -306,6 +307,24 @@ def test_a_run_is_opened_made_or_made_again(
     assert (run.folder / "metrics.csv").read_bytes() == whole
     assert "the seed" in str(why_stale(run, people(SMALL, 1)))
     assert "the data set" in str(run.why_stale("planted", run_parameters(people()), 0))
+
+
+def test_a_run_of_chosen_methods_has_as_many_processes_as_the_notebooks_were_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_people: None
+) -> None:
+    seen = []
+    monkeypatch.setattr(runs, "find_profile", lambda _: SMALL)
+    monkeypatch.setattr(runs, "run_folder", lambda *given: tmp_path / "+".join(given[-1]))
+    monkeypatch.setattr(runs, "Workers", lambda n_jobs, show: seen.append(n_jobs) or Workers(1, show))
+    monkeypatch.setenv(runs.JOBS, "7")
+    assert open_run("phantom", "quick", 0, "coarse, icp").methods == ["coarse", "icp", "truth"]
+    assert (tmp_path / "coarse+icp" / "metrics.csv").is_file()
+    assert seen == [7]
+    with pytest.raises(StudyError, match="got 'ipc'"):
+        open_run("phantom", "quick", 0, "icp,ipc")
+    monkeypatch.setenv(runs.JOBS, "many")
+    with pytest.raises(StudyError, match="STUDY_JOBS: expected a number of processes, got 'many'"):
+        open_run("phantom", "quick", 0, "icp")
 
 
 def test_what_cannot_start_says_so_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

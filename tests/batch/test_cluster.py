@@ -57,11 +57,10 @@ class Cluster:
         self.client = distributed.Client(scheduler_file=str(self.file), set_as_default=False, timeout=PATIENCE_S)
         self.address = self.client.scheduler.address
 
-    def busy(self, name: str) -> bool:
-        """Whether a worker is at work."""
+    def where(self, name: str) -> str:
+        """The address of a worker."""
         workers = self.client.scheduler_info(n_workers=-1)["workers"]
-        where = next(address for address, worker in workers.items() if worker["name"] == name)
-        return bool(self.client.processing().get(where))
+        return next(address for address, worker in workers.items() if worker["name"] == name)
 
     def _wait(self, there: object) -> None:
         end = time.monotonic() + PATIENCE_S
@@ -86,10 +85,12 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 def test_calls_come_back_as_from_here(cluster: Cluster) -> None:
     calls = {"a": (math.sqrt, 4.0), "b": (math.sqrt, -1.0), "c": (math.sqrt, Outcome(9.0))}
     calls["d"] = (math.sqrt, Outcome(error=StudyError("no sternum")))
+    calls["e"] = (os.getpid,)
     told = []
     found = Workers(1, False, cluster.address).run("roots", calls, lambda key, _: told.append(key))
     here = Workers(1, False).run("roots", calls)
-    assert [outcome.value for outcome in found.values()] == [2.0, None, 3.0, None]
+    pid = cluster.processes["one"].pid  # of one worker, too, nothing is computed here
+    assert [outcome.value for outcome in found.values()] == [2.0, None, 3.0, None, pid]
     assert {key: str(outcome.error) for key, outcome in found.items()} == {
         key: str(outcome.error) for key, outcome in here.items()
     }
@@ -110,12 +111,13 @@ def test_a_run_with_a_killed_worker_is_the_local_run(
     monkeypatch.setattr(phantom, "ct_volume", cached_ct_volume)
     people = find_dataset("phantom", SMALL, 0)
     run_study(people, tmp_path / "here", methods=METHODS)
-    journal, killed = tmp_path / ".there.unfinished" / "finished.jsonl", threading.Event()
+    killed = threading.Event()
     cluster.worker("two")
+    where = cluster.where("two")
 
     def kill() -> None:
-        while not (journal.exists() and journal.read_bytes().count(b"\n") >= 2 and cluster.busy("two")):
-            time.sleep(0.005)
+        while not cluster.client.processing().get(where):  # it has a case in its hands
+            time.sleep(0.001)
         cluster.end("two")
         killed.set()
 

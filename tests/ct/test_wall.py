@@ -25,3 +25,28 @@ def test_flattened_wall_gives_depth_under_a_pick(drawn: tuple[Volume, Volume, np
         wall.pick(900.0, 0.0)
     with pytest.raises(StudyError, match="expected lungs"):
         anterior_wall_image(ct.with_values(np.full(ct.shape, 50, np.int16)))
+
+
+def test_a_pick_lies_in_bone_where_no_lung_is_behind_and_off_bone_is_refused(
+    drawn: tuple[Volume, Volume, np.ndarray],
+) -> None:
+    ct, _, _ = drawn
+    grid = ct.to_mm(np.moveaxis(np.indices(ct.shape), 0, -1).reshape(-1, 3)).reshape(*ct.shape, 3)
+    solid = (grid[..., 2] > 30.0) & (np.abs(grid[..., 0]) < 70.0) & (grid[..., 1] < -15.0)
+    deep = anterior_wall_image(ct.with_values(np.where(solid, 40.0, ct.values).astype(np.float32)))
+    assert abs(deep.pick(0.0, 60.0)[1] - 10.0) < 2.0  # the sternum's middle; the sheet behind it runs too deep
+    with pytest.raises(StudyError, match="expected bone or cartilage"):
+        deep.pick(40.0, 33.0)
+
+
+def test_an_abdomen_is_said_to_be_one(drawn: tuple[Volume, Volume, np.ndarray]) -> None:
+    ct, _, _ = drawn
+    values = ct.values.copy()
+    below = (
+        ct.to_mm(np.stack([np.zeros(ct.shape[2]), np.zeros(ct.shape[2]), np.arange(ct.shape[2])], axis=1))[:, 2] < 40.0
+    )
+    values[:, :, below] = np.where(
+        values[:, :, below] < -500, np.where(values[:, :, below] < -900, -1000, 40), values[:, :, below]
+    )
+    with pytest.raises(StudyError, match="abdomen"):
+        anterior_wall_image(ct.with_values(values))

@@ -21,15 +21,35 @@ VIEW = figures.CoarseView(
     chest=POINTS[:, [0, 2]] * [-1, 1],
     parts=PARTS,
 )
+SCORES = figures.ScoreView(
+    values=np.linspace(0, 1, 600).reshape(20, 30),
+    origin=np.array([-50.0, -70.0]),
+    pixel_mm=5.0,
+    angles_deg=np.arange(-90.0, 90.0, 10.0),
+    best=np.linspace(0.3, 0.9, 18),
+    plane=POINTS[:, [0, 2]],
+    centre=np.array([0.0, 10.0]),
+    angle_deg=20.0,
+)
 EXAMPLES: dict[str, Callable[[], Figure]] = {
     "coarse_steps": lambda: figures.coarse_steps({"CT": VIEW, "US": VIEW}),
+    "score_maps": lambda: figures.score_maps({"CT": SCORES, "US": SCORES}),
     "coarse_overlay": lambda: figures.coarse_overlay(POINTS + 300.0, POINTS, POINTS + 1.0),
 }
 REFUSED: dict[str, Callable[[], Figure]] = {
+    "no scores": lambda: figures.score_maps({}),
     "no views": lambda: figures.coarse_steps({}),
     "a view without points": lambda: figures.coarse_steps({"CT": replace(VIEW, plane=np.zeros((0, 2)))}),
     "no points": lambda: figures.coarse_overlay(np.zeros((0, 3)), POINTS, POINTS),
 }
+
+
+def test_the_score_map_lies_at_its_millimetres() -> None:
+    figure = figures.score_maps({"CT": SCORES})
+    image = figure.axes[1].get_images()[0]
+    np.testing.assert_allclose(image.get_extent(), [-52.5, 47.5, -72.5, 77.5])
+    np.testing.assert_allclose(image.get_array(), SCORES.values.T)
+    assert "$F_k$ at 20°, 5 mm a pixel" in figure.axes[1].get_title(loc="left")
 
 
 def test_coarse_steps_shows_three_rectangles_and_eight_seeds_a_cloud() -> None:

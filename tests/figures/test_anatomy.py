@@ -24,9 +24,18 @@ def volumes() -> tuple[Volume, Volume]:
     return whole, Volume(mask, spacing, RigidTransform(translation=whole.to_mm([[5, 4, 6]])[0]), "parts")
 
 
+def wall() -> figures.FrontWall:
+    volume, _ = volumes()
+    x_mm, z_mm = (volume.to_mm(np.eye(3)[axis] * np.arange(volume.shape[axis])[:, None])[:, axis] for axis in (0, 2))
+    return figures.FrontWall(np.asarray(volume.values, dtype=np.float64).mean(axis=1).T, x_mm, z_mm, "a")
+
+
+FRAMES = {"cartilage": np.eye(20, 30), "rib": np.eye(20, 30)}
 EXAMPLES: dict[str, Callable[[], Figure]] = {
     "ct_slice": lambda: figures.ct_slice(*volumes()),
     "anatomy_overview": lambda: figures.anatomy_overview({"a": volumes(), "b": volumes()}),
+    "front_wall": lambda: figures.front_wall(wall(), volumes()[1], reference=volumes()[1]),
+    "biomarker": lambda: figures.biomarker(wall(), volumes()[1], FRAMES, (51.0, 35.0)),
     "mesh_and_cloud": lambda: figures.mesh_and_cloud(TETRAHEDRON, CLOUD),
 }
 REFUSED: dict[str, Callable[[], Figure]] = {
@@ -37,6 +46,10 @@ REFUSED: dict[str, Callable[[], Figure]] = {
         volumes()[0], Volume(volumes()[1].values, np.array([1.0, 1.0, 1.0]))
     ),
     "place outside": lambda: figures.ct_slice(*volumes(), at_mm=(500.0, 0.0, 0.0)),
+    "an empty mask of a wall": lambda: figures.front_wall(
+        wall(), volumes()[1].with_values(np.full(volumes()[1].shape, -1))
+    ),
+    "no frames": lambda: figures.biomarker(wall(), volumes()[1], {}, (51.0, 35.0)),
     "no subjects": lambda: figures.anatomy_overview({}),
 }
 
@@ -62,6 +75,19 @@ def test_the_legend_of_a_slice_names_only_what_is_there() -> None:
     assert "sternum" in shown
     assert "cartilage 3" in shown
     assert "cartilage 4" not in shown
+
+
+def test_the_front_wall_lies_under_the_outlines_of_its_parts() -> None:
+    _, mask = volumes()
+    ax = figures.front_wall(wall(), mask).axes[0]
+    (image,) = ax.get_images()
+    low, high, bottom, top = image.get_extent()
+    vertices = np.concatenate([p.vertices for drawn in ax.collections for p in drawn.get_paths() if len(p.vertices)])
+    inside = mask.to_mm(np.argwhere(mask.values >= 0))
+    np.testing.assert_allclose(vertices[:, 0].max(), -inside[:, 0].min() + mask.spacing_mm[0] / 2, atol=1e-6)
+    np.testing.assert_allclose(vertices[:, 1].max(), inside[:, 2].max() + mask.spacing_mm[2] / 2, atol=1e-6)
+    assert bottom < top
+    assert low < high
 
 
 def test_image_pixels_lie_at_their_millimetres() -> None:

@@ -61,11 +61,24 @@ def steps() -> pd.DataFrame:
     )
 
 
+def intervals() -> pd.DataFrame:
+    rows = [("icp", -2.0, -3.0, -1.0, False), ("cpd", 0.5, -1.0, 1.0, True)]
+    return pd.DataFrame(
+        [
+            dict(zip(("against", "value", "low", "high", "is_tie"), row, strict=True), metric=metric, dataset=dataset)
+            for metric in ("hd", "true_waypoint_error")
+            for dataset in ("phantom", "open")
+            for row in rows
+        ]
+    )
+
+
 EXAMPLES: dict[str, Callable[[], Figure]] = {
     "sensitivity": lambda: figures.sensitivity(choices()),
     "error_budget": lambda: figures.error_budget(budget()),
     "paired_differences": lambda: figures.paired_differences(paired(), "skeleton_graph", "Waypoint error"),
     "way": lambda: figures.way(steps()),
+    "difference_rows": lambda: figures.difference_rows(intervals(), "skeleton_graph"),
 }
 REFUSED: dict[str, Callable[[], Figure]] = {
     "empty choices": lambda: figures.sensitivity(choices().iloc[:0]),
@@ -73,6 +86,7 @@ REFUSED: dict[str, Callable[[], Figure]] = {
     "nothing paired": lambda: figures.sensitivity(choices()[lambda t: (t["role"] == "paper") ^ (t["case"] == "ct1")]),
     "budget without paths": lambda: figures.error_budget(budget()[lambda t: t["metric"] != "waypoint_error"]),
     "a way without steps": lambda: figures.way(steps().iloc[:0]),
+    "no intervals": lambda: figures.difference_rows(intervals().iloc[:0], "icp"),
     "no differences": lambda: figures.paired_differences(paired().iloc[:0], "icp", "Waypoint error"),
 }
 
@@ -112,11 +126,30 @@ def test_paired_differences_say_once_which_side_is_better() -> None:
 
 def test_error_budget_keeps_the_order_of_sources_and_starts_at_zero() -> None:
     figure = figures.error_budget(budget())
-    left, right = figure.axes
+    left, *panels = figure.axes
+    assert len(panels) == len(METHODS)  # a family each
     assert [label.get_text() for label in left.get_yticklabels()] == ["none", "latency", "all"]
     bottom, top = left.get_ylim()
     assert bottom > top  # the first source on top
-    assert left.get_xlim()[0] == right.get_xlim()[0] == 0
+    assert left.get_xlim()[0] == 0
+    assert {panel.get_xlim() for panel in panels} == {panels[0].get_xlim()}
+    assert panels[0].get_xlim()[0] == 0
+
+
+def test_tuned_and_shipped_of_one_method_share_a_panel() -> None:
+    both = pd.concat([budget(), budget()[lambda t: t["metric"] == "waypoint_error"].assign(method="icp_tuned")])
+    figure = figures.error_budget(both)
+    assert [ax.get_title(loc="left") for ax in figure.axes[:2]] == ["the cloud itself", "ICP"]
+    assert len(figure.axes) == 1 + len(METHODS)
+
+
+def test_difference_rows_say_who_judges_and_leave_ties_hollow() -> None:
+    figure = figures.difference_rows(intervals(), "skeleton_graph")
+    titles = [ax.get_title(loc="left").replace("\n", " ") for ax in figure.axes]
+    assert titles == ["Hausdorff distance, by the paper's protocol", "True waypoint error"]
+    marks = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 1 and line.get_marker() != "None"]
+    assert [line.get_markerfacecolor() == "white" for line in marks] == [False, True, False, True]
+    assert [line.get_xdata()[0] for line in marks] == [-2.0, 0.5, -2.0, 0.5]
 
 
 def test_the_way_has_a_row_a_step_and_its_mean() -> None:

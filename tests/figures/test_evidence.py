@@ -77,6 +77,17 @@ def test_clouds_that_fail_every_method_are_counted_once() -> None:
     assert "×6" not in shown
 
 
+def test_choices_are_cut_into_pages_that_hold_every_one_once() -> None:
+    summary = tried()
+    whole = [name for page in figures.choice_pages(summary) for name in page]
+    pages = figures.choice_pages(summary, most=3)
+    assert len(pages) > 1
+    assert [name for page in pages for name in page] == whole
+    assert set(whole) == set(summary.loc[summary["role"] != "paper", "choice"])
+    part = texts(figures.choices(summary, pages[0]))
+    assert all((f"{name}:" in part) == (name in pages[0]) for name in whole)
+
+
 def test_choices_have_a_row_each_with_the_change_of_every_measure() -> None:
     figure = figures.choices(tried())
     shown = texts(figure)

@@ -16,8 +16,6 @@ def test_methods_keep_their_colour_and_tuned_ones_are_solid() -> None:
     for name in METHODS:
         shipped, tuned = figures.method_style(name), figures.method_style(f"{name}_tuned")
         assert shipped.colour == tuned.colour
-        assert shipped.hatch
-        assert not tuned.hatch
         assert sum(shipped.face) > sum(tuned.face)
     assert len({figures.METHOD_STYLE[name].colour for name in METHODS}) == len(METHODS)
     assert len({figures.METHOD_STYLE[name].marker for name in METHODS}) == len(METHODS)
@@ -31,8 +29,7 @@ def test_parameters_are_told_by_the_fill_and_the_surface_by_the_outline() -> Non
         assert {(one.colour, one.marker) for one in (whole, visible, tuned, tuned_whole)} == {
             (whole.colour, whole.marker)
         }
-        assert (whole.face, whole.hatch) == (visible.face, visible.hatch) != (tuned.face, tuned.hatch)
-        assert (tuned.face, tuned.hatch) == (tuned_whole.face, tuned_whole.hatch)
+        assert whole.face == visible.face != tuned.face == tuned_whole.face
         assert whole.edge == tuned_whole.edge == whole.colour
         assert visible.edge == tuned.edge == "#000000"
         assert len({one.label for one in (whole, visible, tuned, tuned_whole)}) == 4
@@ -41,18 +38,14 @@ def test_parameters_are_told_by_the_fill_and_the_surface_by_the_outline() -> Non
 
 def test_every_method_of_the_study_is_listed_and_looks_different() -> None:
     listed = {name: figures.METHOD_STYLE[name] for name in study.METHODS}
-    looks = {(style.colour, style.marker, style.face, style.hatch, style.edge) for style in listed.values()}
+    looks = {(style.colour, style.marker, style.face, style.edge) for style in listed.values()}
     assert len(looks) == len({style.label for style in listed.values()}) == len(listed)
 
 
 def test_the_outline_is_drawn() -> None:
-    bars, boxes = (
-        draw(metrics(("icp_tuned", "icp_tuned_whole"))).axes[0].patches
-        for draw in (figures.hd_bars, figures.waypoint_boxes)
-    )
-    for patches in (bars, boxes):
-        edges = {tuple(patch.get_edgecolor()[:3]) for patch in patches}
-        assert {to_rgb("#000000"), to_rgb(figures.METHOD_STYLE["icp"].colour)} <= edges
+    patches = figures.waypoint_boxes(metrics(("icp_tuned", "icp_tuned_whole"))).axes[0].patches
+    edges = {tuple(patch.get_edgecolor()[:3]) for patch in patches}
+    assert {to_rgb("#000000"), to_rgb(figures.METHOD_STYLE["icp"].colour)} <= edges
 
 
 def test_a_new_method_needs_no_entry_here() -> None:
@@ -73,7 +66,7 @@ def test_a_new_method_looks_like_no_listed_one() -> None:
 
 def test_new_methods_are_drawn_among_the_others_and_named() -> None:
     methods = (*METHODS, "bayesian_cpd", "bayesian_cpd_tuned")
-    figure = figures.hd_bars(metrics(methods))
+    figure = figures.waypoint_boxes(metrics(methods))
     assert "bayesian cpd, tuned" in texts(figure)
     edges = {tuple(bar.get_edgecolor()[:3]) for bar in figure.axes[0].patches}
     assert to_rgb(figures.method_style("bayesian_cpd").colour) in edges

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from study.files.atomic import digest_of, json_text, replacing, sha256_of, write_bytes, write_json, write_text
+from study.files.atomic import digest_of, filling, json_text, replacing, sha256_of, write_bytes, write_json, write_text
 
 
 @pytest.mark.parametrize("alone", [True, False])
@@ -74,3 +74,50 @@ def test_the_hash_is_that_of_the_bytes(tmp_path: Path) -> None:
     path.write_bytes(b"abc")
     assert sha256_of(path) == hashlib.sha256(b"abc").hexdigest()
     assert digest_of(path, "md5") == hashlib.md5(b"abc").hexdigest()
+
+
+def test_a_folder_is_filled_whole_or_not_at_all(tmp_path: Path) -> None:
+    names = ["a.txt", "b.txt", "last.json"]
+    with filling(tmp_path / "new" / "out", names, "last.json") as new:
+        for name in names:
+            (new / name).write_text("1")
+    out = tmp_path / "new" / "out"
+    (out / "mine.txt").write_text("mine")
+
+    def fail() -> None:
+        with filling(out, names, "last.json") as new:
+            (new / "a.txt").write_text("2")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert {path.name: path.read_text() for path in out.iterdir()} == {**dict.fromkeys(names, "1"), "mine.txt": "mine"}
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+    with filling(out, names, "last.json") as new:
+        (new / "last.json").write_text("3")
+        (new / "a.txt").write_text("3")
+    assert {path.name: path.read_text() for path in out.iterdir()} == {
+        "a.txt": "3", "last.json": "3", "mine.txt": "mine"
+    }  # fmt: skip
+
+
+def test_where_filling_is_killed_the_last_file_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_text(tmp_path / "out" / "last.json", "old")
+    write_text(tmp_path / "out" / "a.txt", "old")
+    replace = Path.replace
+
+    def once(self: Path, target: Path) -> Path:
+        if target.name == "b.txt":
+            raise KeyboardInterrupt
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", once)
+
+    def write() -> None:
+        with filling(tmp_path / "out", ["last.json", "a.txt", "b.txt"], "last.json") as new:
+            for name in ("last.json", "a.txt", "b.txt"):
+                (new / name).write_text("new")
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert {path.name: path.read_text() for path in (tmp_path / "out").iterdir()} == {"a.txt": "new"}

@@ -1,17 +1,15 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
+import open3d as o3d
 import pytest
 import trimesh
 
 from study.errors import StudyError
-from study.files.clouds import read_ply, read_timed_ply, read_waypoints, write_ply, write_registration
-from study.registration import Registration
-from study.types import PointCloud, RigidTransform, Waypoints
+from study.files.clouds import read_ply, read_ply_file, read_timed_ply, write_ply
+from study.types import PointCloud
 
 POINTS = np.random.default_rng(5).normal([0.0, -900.0, 1200.0], 60.0, size=(400, 3))
 
@@ -81,78 +79,78 @@ def test_a_cut_off_ply_is_refused(tmp_path: Path) -> None:
         read_ply(path)
 
 
-def test_missing_files_and_nan_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match="no such file"):
         read_ply(tmp_path / "none.ply")
-    with pytest.raises(StudyError, match=r"none\.csv"):
-        read_waypoints(tmp_path / "none.csv")
-    (tmp_path / "nan.csv").write_text("x,y,z\n1,2,3\n1,,3\n")
-    with pytest.raises(StudyError, match=r"nan\.csv: expected finite numbers .* got others in line 3"):
-        read_waypoints(tmp_path / "nan.csv")
-    (tmp_path / "words.csv").write_text("x,y,z\n1,two,3\n")
-    with pytest.raises(StudyError, match=r"words\.csv"):
-        read_waypoints(tmp_path / "words.csv")
-    (tmp_path / "names.csv").write_text("a,b,c\n1,2,3\n")
-    with pytest.raises(StudyError, match="columns x, y, z, got a, b, c"):
-        read_waypoints(tmp_path / "names.csv")
-    (tmp_path / "empty.csv").write_text("")
-    with pytest.raises(StudyError, match=r"empty\.csv"):
-        read_waypoints(tmp_path / "empty.csv")
 
 
-def test_waypoints_are_taken_by_column_name(tmp_path: Path) -> None:
-    (tmp_path / "w.csv").write_text("name,z,y,x\nR2-3.1,3,2,1\nR2-3.2,6,5,4\n")
-    path = read_waypoints(tmp_path / "w.csv")
-    assert path.points.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert path.labels == ("line 2", "line 3")
+# --- space, faces, parts ---------------------------------------------------------------------------------------------
 
 
-def test_waypoints_keep_their_labels_and_count_as_the_file_does(tmp_path: Path) -> None:
-    (tmp_path / "w.csv").write_text("label,x,y,z\nR2-3.1,1,2,3\n\n,4,5,6\n")
-    assert read_waypoints(tmp_path / "w.csv").labels == ("R2-3.1", "line 4")
+def retagged(path: Path, comment: str) -> Path:
+    """A file that another tool wrote: with its comment in the place of ours."""
+    path.write_bytes(path.read_bytes().replace(b"comment SPACE=RAS\n", comment.encode("ascii")))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("comment", "space", "sign"),
+    [("comment SPACE=RAS\n", "RAS", 1), ("comment 3D Slicer output. SPACE=LPS\n", "LPS", -1), ("", None, 1)],
+)
+def test_a_file_is_turned_by_the_space_that_it_states(
+    tmp_path: Path, comment: str, space: str | None, sign: int
+) -> None:
+    times = np.arange(len(POINTS)) / 10
+    path = retagged(write_ply(PointCloud(POINTS, times=times), tmp_path / "cloud.ply"), comment)
+    read = read_ply_file(path)
+    assert read.space == space
+    assert np.array_equal(read.points, POINTS * [sign, sign, 1])
+    assert np.array_equal(read_ply(path), read.points)
+    assert read.times is not None
+    assert np.array_equal(read.times, times)
+
+
+@pytest.mark.parametrize("comment", ["comment SPACE=RAI\n", "comment SPACE=RAS\ncomment SPACE=LPS\n"])
+def test_a_space_that_is_none_or_two_is_refused(tmp_path: Path, comment: str) -> None:
+    path = retagged(write_ply(PointCloud(POINTS), tmp_path / "cloud.ply"), comment)
+    with pytest.raises(StudyError, match=r"cloud\.ply: expected (the space RAS or LPS|one comment SPACE=)"):
+        read_ply(path)
+
+
+def test_what_is_written_says_ras_in_a_comment_of_its_own(tmp_path: Path) -> None:
+    header = write_ply(PointCloud(POINTS), tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0]
+    assert b"\ncomment SPACE=RAS\n" in header  # as 3D Slicer's reader wants it
+
+
+def test_faces_parts_and_columns_are_read_by_other_libraries(tmp_path: Path) -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=80.0)
+    n = len(sphere.vertices)
+    parts, far = np.arange(n) % 10 - 1, np.linspace(0, 7, n)
+    cloud = PointCloud(sphere.vertices, parts=parts)
+    path = write_ply(cloud, tmp_path / "mesh.ply", faces=sphere.faces, columns={"us_distance": far})
+    read = read_ply_file(path)
+    assert read.faces is not None
+    assert np.array_equal(read.faces, sphere.faces)
+    assert np.array_equal(read.points, sphere.vertices)
+    other = trimesh.load(path, process=False)
+    assert other.volume == pytest.approx(sphere.volume)  # the winding too
+    columns = other.metadata["_ply_raw"]["vertex"]["data"]
+    assert np.array_equal(np.ravel(columns["part"]), parts)
+    assert np.array_equal(np.ravel(columns["us_distance"]), far)
+    third = o3d.io.read_triangle_mesh(str(path))
+    assert np.array_equal(np.asarray(third.vertices), sphere.vertices)
+    assert np.array_equal(np.asarray(third.triangles), sphere.faces)
+    assert len(o3d.io.read_point_cloud(str(write_ply(cloud, tmp_path / "cloud.ply"))).points) == n
+    assert read_ply_file(tmp_path / "cloud.ply").faces is None
+    path.write_bytes(path.read_bytes()[:-100])  # cut off within the faces
+    with pytest.raises(StudyError, match=r"mesh\.ply: expected a PLY file with points"):
+        read_ply(path)
 
 
 def test_another_suffix_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match=r"ends in \.ply, got 'cloud\.stl'"):
         write_ply(PointCloud(POINTS), tmp_path / "cloud.stl")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_registration_is_written_whole(tmp_path: Path) -> None:
-    T = RigidTransform.random(np.random.default_rng(1))
-    result = Registration(POINTS, T.apply(POINTS), T, False, 7, "iteration limit", warnings=("few points",))
-    path = Waypoints(POINTS[:4], tuple(f"line {k + 2}" for k in range(4)))
-    lines = write_registration(result, tmp_path / "out", path, radius_mm=60.0)
-    assert {entry.name for entry in (tmp_path / "out").iterdir()} == {
-        "warped.ply", "registration.json", "waypoints_us.csv"
-    }  # fmt: skip
-    assert len(lines) == 3
-    assert np.array_equal(read_ply(tmp_path / "out" / "warped.ply"), result.warped)
-    summary = json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))
-    assert np.array_equal(summary["T_us_ct"], T.matrix)
-    assert (summary["converged"], summary["warnings"]) == (False, ["few points"])
-    header, *rows = (tmp_path / "out" / "waypoints_us.csv").read_text(encoding="utf-8").splitlines()
-    assert header == "x,y,z"
-    moved = [[float(value) for value in row.split(",")] for row in rows]
-    assert np.allclose(moved, T.apply(POINTS[:4]), rtol=0, atol=1e-9)
-
-
-def test_a_bad_waypoint_is_flagged_and_the_good_ones_survive(tmp_path: Path) -> None:
-    T = RigidTransform.random(np.random.default_rng(1))
-    result = Registration(POINTS, T.apply(POINTS), T, True, 7, "at rest")
-    path = Waypoints(np.vstack([POINTS[:1], [[9e3, 0, 0]], POINTS[1:2]]), ("R2-3.1", "far", "R2-3.2"))
-    lines = write_registration(result, tmp_path / "out", path, radius_mm=60.0)
-    assert lines[-1].startswith("waypoint not carried: far: expected at least 3 CT points")
-    table = pd.read_csv(tmp_path / "out" / "waypoints_us.csv", keep_default_na=False, na_values={"x": ""})
-    assert table["label"].to_list() == ["R2-3.1", "far", "R2-3.2"]
-    assert table["x"].isna().to_list() == [False, True, False]
-    assert [bool(reason) for reason in table["reason"]] == [False, True, False]
-    warnings = json.loads((tmp_path / "out" / "registration.json").read_text(encoding="utf-8"))["warnings"]
-    assert len(warnings) == 1
-    assert "far" in warnings[0]
-    with pytest.raises(StudyError, match="expected one or more that can be carried, got none: far"):
-        write_registration(result, tmp_path / "none", Waypoints(path.points[1:2], ("far",)))
-    assert not (tmp_path / "none").exists()
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

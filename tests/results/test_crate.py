@@ -112,9 +112,9 @@ def test_every_name_leads_somewhere(made):
 
 def test_it_is_held_to_its_hash_and_follows_the_figures(made):
     assert made.altered is None
-    made.keep_figures({"waypoints": b"picture", "p03#1": b"of a further sweep"})
+    made.keep_figures({"waypoints.png": b"picture", "p03#1.png": b"of a further sweep"})
     (made.folder / "50_study.ipynb").write_text("{}", encoding="utf-8")
-    made.keep_figures({"hausdorff": b"another"})
+    made.keep_figures({"hausdorff.png": b"another"})
     crate = ROCrate(str(made.folder))
     assert {"waypoints.png", "hausdorff.png", "50_study.ipynb"} <= {entity.id for entity in crate.data_entities}
     assert crate.dereference("waypoints.png")["contentSize"] == "7"

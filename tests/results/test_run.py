@@ -172,18 +172,18 @@ def test_an_older_provenance_is_told_and_no_crash(tmp_path):
 
 def test_figures_belong_to_the_run_they_are_of(tmp_path):
     run = written(tmp_path / "run", some_rows())
-    assert run.keep_figures({"waypoints": b"picture"}) == ["waypoints.png"]
-    assert run.keep_figures({"waypoints": b"another"}) == ["waypoints.png"]
+    assert run.keep_figures({"waypoints.png": b"picture"}) == ["waypoints.png"]
+    assert run.keep_figures({"waypoints.png": b"another"}) == ["waypoints.png"]
     assert Run(run.folder).altered is None
     assert "waypoints.png" in Run(run.folder).provenance["files_sha256"]
     (run.folder / "waypoints.png").write_bytes(b"edited")
     with pytest.raises(StudyError, match=r"edited waypoints\.png"):
-        run.keep_figures({"hausdorff": b"picture"})
+        run.keep_figures({"hausdorff.png": b"picture"})
     later = written(tmp_path / "run", some_rows(seed=1))
     record = {**later.provenance, "finished": "later"}
     write_json(record, run.folder / "provenance.json")
     with pytest.raises(StudyError, match="got a later one"):
-        run.keep_figures({"waypoints": b"picture"})
+        run.keep_figures({"waypoints.png": b"picture"})
     assert not (run.folder / "waypoints.png").exists()  # a figure of an earlier run is not beside later metrics
 
 

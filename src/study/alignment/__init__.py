@@ -4,7 +4,7 @@ from study.alignment.branches import Branches
 from study.alignment.chest import Alignment, Chest, ChestSearch, align, find_chest
 from study.alignment.frame import ChestFrame, chest_frame
 from study.alignment.roots import RootMeasures, measure_roots
-from study.alignment.sternum import SternumFit, SternumParams
+from study.alignment.sternum import SternumFit, SternumParams, SternumScores, sternum_scores
 
 __all__ = [
     "Alignment",
@@ -15,8 +15,10 @@ __all__ = [
     "RootMeasures",
     "SternumFit",
     "SternumParams",
+    "SternumScores",
     "align",
     "chest_frame",
     "find_chest",
     "measure_roots",
+    "sternum_scores",
 ]

@@ -61,6 +61,42 @@ class SternumFit:
         return (*(self.coarser.searches if self.coarser else ()), self)
 
 
+@dataclass(frozen=True)
+class SternumScores:
+    """F_k of Eq. 1 over the feature plane, as a share of the rectangle's area.
+
+    Attributes:
+        values: (w, h) of a template with its centre at each pixel, at the rotation of the fit.
+        origin: (2,) mm, the centre of the first pixel.
+        pixel_mm: edge of a pixel.
+        angles_deg: (a,) every rotation of the first search.
+        best: (a,) the largest value at each of them.
+    """
+
+    values: Floats
+    origin: Floats
+    pixel_mm: float
+    angles_deg: Floats
+    best: Floats
+
+
+def sternum_scores(points: Floats, fit: SternumFit, params: SternumParams | None = None) -> SternumScores:
+    """What the first, coarse search saw around a fit, for a picture of it.
+
+    Args:
+        points: (n, 2) mm in the feature plane.
+        fit: of that search, or one of a finer scale.
+        params: sizes, scales and steps.
+    """
+    p = params or SternumParams()
+    scale_mm = p.scales_mm[0]
+    image, origin = _closed_image(points, scale_mm, p, 2 * sample_spacing_mm(points))
+    angles = np.arange(-90.0, 90.0, p.steps_deg[0])
+    best = np.array([covered.max() for covered in _covered(image, p, scale_mm, angles)])
+    (values,) = _covered(image, p, scale_mm, np.array([fit.searches[0].angle_deg]))
+    return SternumScores(values, origin, scale_mm, angles, best)
+
+
 def feature_plane(cloud: PointCloud) -> RigidTransform:
     """The plane normal to the third principal direction (sec. III-A.1), seen from either face.
 
@@ -96,6 +132,25 @@ def rectangle_mask(width_mm: float, height_mm: float, pixel_mm: float, angle_deg
     return covered
 
 
+def _closed_image(points: Floats, scale_mm: float, params: SternumParams, close_mm: float) -> tuple[Floats, Floats]:
+    """The cloud as an image without gaps, padded by half a template, and the centre of its first pixel (2,) mm."""
+    pad = int(np.ceil(np.hypot(params.width_mm, params.height_mm) / 2 / scale_mm)) + 1
+    image, _, origin = pixelise(points, scale_mm, pad)
+    return close_gaps(image, round(close_mm / scale_mm)).astype(np.float64), origin
+
+
+def _covered(image: Floats, params: SternumParams, scale_mm: float, angles: Floats) -> Iterator[Floats]:
+    """F_k of Eq. 1 over the rectangle's area at each rotation, by FFT, with the template's centre at each pixel."""
+    # The padding is wide enough for a circular convolution: what wraps around meets empty pixels.
+    shape = [next_fast_len(length, real=True) for length in image.shape]
+    seen, rows, columns = rfft2(image, shape), *image.shape
+    for angle in angles:
+        mask = rectangle_mask(params.width_mm, params.height_mm, scale_mm, float(angle))
+        product = irfft2(seen * rfft2(mask[::-1, ::-1], shape), shape)
+        half = len(mask) // 2
+        yield np.roll(product, (-half, -half), axis=(0, 1))[:rows, :columns] / mask.sum()
+
+
 def _best_place(
     points: Floats, scale_mm: float, angles: Floats, near: Floats | None, params: SternumParams, close_mm: float
 ) -> list[SternumFit]:
@@ -103,21 +158,12 @@ def _best_place(
     reach_mm = np.hypot(params.width_mm, params.height_mm)
     if near is not None:  # what the templates cannot reach need not be convolved
         points = points[np.linalg.norm(points - near, axis=1) < reach_mm / 2 + 3 * params.scales_mm[0]]
-    pad = int(np.ceil(reach_mm / 2 / scale_mm)) + 1
-    image, _, origin = pixelise(points, scale_mm, pad)
-    image = close_gaps(image, round(close_mm / scale_mm)).astype(np.float64)
-    # The padding is wide enough for a circular convolution: what wraps around meets empty pixels.
-    shape = [next_fast_len(length, real=True) for length in image.shape]
-    seen, rows, columns = rfft2(image, shape), *image.shape
+    image, origin = _closed_image(points, scale_mm, params, close_mm)
     if near is not None:  # stay on the sternum of the coarser scale
         away = np.hypot(*(np.indices(image.shape) * scale_mm + origin[:, None, None] - near[:, None, None]))
         barred = away > 2.5 * params.scales_mm[0]
     fits = []
-    for angle in angles:
-        mask = rectangle_mask(params.width_mm, params.height_mm, scale_mm, float(angle))
-        product = irfft2(seen * rfft2(mask[::-1, ::-1], shape), shape)
-        half = len(mask) // 2
-        covered = np.roll(product, (-half, -half), axis=(0, 1))[:rows, :columns] / mask.sum()
+    for angle, covered in zip(angles, _covered(image, params, scale_mm, angles), strict=True):
         if near is not None:
             covered[barred] = 0.0
         best = float(covered.max())

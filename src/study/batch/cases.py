@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from study.alignment.chest import Chest, find_chest
 from study.batch.workers import Call, Outcome, Workers, attempt
 from study.datasets import Anatomy, Dataset, Patient
+from study.evaluation.judgement import Judgement
 from study.evaluation.metrics import judge
 from study.evaluation.pair import TRUTH, Pair, perfect
 from study.files.atomic import sha256_of
@@ -18,6 +19,7 @@ from study.methods import METHODS
 from study.naming import split_sweep
 from study.offline import is_offline
 from study.pipeline import find_method, register_aligned
+from study.results.clouds import CaseName, pack
 from study.results.journal import Journal
 from study.results.metrics_csv import TIMING_COLUMNS, Case, Row, failed_row, metric_rows
 from study.seeds import named_rng
@@ -43,6 +45,7 @@ class Work:
         inputs: SHA-256 of the files of each person of their own, by name and key.
         traces: where in the code steps failed that nobody foresaw.
         peak_mb: the most memory that one process held in a finished step, now or before a run was stopped.
+        keeps_clouds: for pictures of each case, see `study.results.clouds`.
     """
 
     dataset: Dataset
@@ -51,23 +54,24 @@ class Work:
     inputs: dict[str, dict[str, str]] = field(default_factory=dict)
     traces: dict[Step, str] = field(default_factory=dict)
     peak_mb: float = 0.0
+    keeps_clouds: bool = True
 
     def do(self, label: str, calls: Mapping[Step, Call]) -> dict[Step, Outcome]:
         """Do steps; a finished one is kept at once."""
         return self.workers.run(f"{self.dataset.name}: {label}", calls, self._done)
 
     def finished(self, step: Step) -> Outcome | None:
-        """A step that was done, now or before a run was stopped; its value where it is rows."""
+        """A step that was done, now or before a run was stopped; its value where it is a registration."""
         piece = self.journal.get(self._facts(step))
         if piece is None:
             return None
         self.peak_mb = max(self.peak_mb, piece["peak_mb"])
-        return Outcome(piece["rows"], seconds=piece["seconds"], peak_mb=piece["peak_mb"])
+        return Outcome(piece["value"], seconds=piece["seconds"], peak_mb=piece["peak_mb"])
 
     def _done(self, step: Step, outcome: Outcome) -> None:
         if outcome.error is None:  # what failed is tried again: it may have been the network, or memory
-            rows = outcome.value if step.stage == "register" else None
-            kept = {"rows": rows, "seconds": outcome.seconds, "peak_mb": outcome.peak_mb}
+            value = outcome.value if step.stage == "register" else None
+            kept = {"value": value, "seconds": outcome.seconds, "peak_mb": outcome.peak_mb}
             self.journal.keep(self._facts(step), kept)
         elif outcome.trace:
             self.traces[step] = outcome.trace
@@ -81,8 +85,16 @@ class Work:
         }
 
 
-def all_rows(work: Work, methods: list[str]) -> tuple[list[Row], list[Row]]:
-    """Rows of all metrics and timings, see `run_dataset`."""
+class Results(NamedTuple):
+    """What a run gave: rows of ``metrics.csv`` and ``timings.csv``, and the packed clouds of each case."""
+
+    rows: list[Row]
+    timings: list[Row]
+    clouds: dict[CaseName, str]
+
+
+def all_cases(work: Work, methods: list[str]) -> Results:
+    """Every case, see `run_dataset`."""
     dataset = work.dataset
     everybody = dataset.pairs()
     fetched = _fetch(work)
@@ -99,13 +111,25 @@ def all_rows(work: Work, methods: list[str]) -> tuple[list[Row], list[Row]]:
     pairs = _pairs(work, fetched, list(dict.fromkeys((step.source, step.target) for step in missing)))
     outcomes |= work.do(
         "registrations",
-        {step: (run_case, cases[step], pairs[step.source, step.target], dataset.params.radius_mm) for step in missing},
+        {
+            step: (
+                run_case,
+                cases[step],
+                pairs[step.source, step.target],
+                dataset.params.radius_mm,
+                work.keeps_clouds,
+            )
+            for step in missing
+        },
     )
     rows: list[Row] = []
+    clouds: dict[CaseName, str] = {}
     for step, case in cases.items():
         outcome = outcomes[step]
-        rows += [failed_row(case, str(outcome.error))] if outcome.error else outcome.value
-    return rows, _timing_rows(work, [*_people_steps(everybody, list(fetched)), *cases])
+        rows += [failed_row(case, str(outcome.error))] if outcome.error else outcome.value["rows"]
+        if not outcome.error and work.keeps_clouds:
+            clouds[step.source, step.target, step.method] = outcome.value["clouds"]
+    return Results(rows, _timing_rows(work, [*_people_steps(everybody, list(fetched)), *cases]), clouds)
 
 
 def _fetch(work: Work) -> dict[str, Outcome]:
@@ -206,11 +230,11 @@ def _pair(dataset: Dataset, source: Anatomy, patient: Patient, ct: Chest, us: Ch
     return pair
 
 
-def run_case(case: Case, pair: Pair, radius_mm: float) -> list[Row]:
+def run_case(case: Case, pair: Pair, radius_mm: float, keeps_clouds: bool = False) -> dict[str, Any]:
     """Register and judge one pair; of method ``TRUTH``, what a perfect registration scores.
 
     Returns:
-        rows of ``metrics.csv``.
+        ``rows`` of ``metrics.csv``; where clouds are kept, packed ``clouds``.
 
     Raises:
         StudyError: the method or the path transfer failed, or gave values that are not finite.
@@ -220,7 +244,10 @@ def run_case(case: Case, pair: Pair, radius_mm: float) -> list[Row]:
     else:
         rng = named_rng(case.seed, f"{pair.name}/{case.method}")
         result = register_aligned(pair.alignment, find_method(case.method), rng)
-    return metric_rows(case, judge(pair, result, radius_mm), converged=result.converged)
+    rows = metric_rows(case, judge(pair, result, radius_mm), converged=result.converged)
+    if not keeps_clouds:
+        return {"rows": rows}
+    return {"rows": rows, "clouds": pack(result, Judgement(pair, result, radius_mm).moved, pair.alignment.T_us_ct)}
 
 
 def _timing_rows(work: Work, steps: list[Step]) -> list[Row]:

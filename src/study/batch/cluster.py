@@ -43,8 +43,20 @@ def connected(address: str) -> Iterator[None]:
         ) from error
     with client:
         _require_one_thread(client)
-        with parallel_config(backend="dask", client=client, wait_for_workers_timeout=CONNECT_S):
+        with parallel_config(backend=_backend(client)):
             yield
+
+
+def _backend(client: Any) -> Any:
+    """Joblib's back end for this cluster; with one worker, too, where joblib would compute in this process instead."""
+    from joblib._dask import DaskDistributedBackend  # registered by name only, and a name takes no subclass
+
+    class Cluster(DaskDistributedBackend):  # type: ignore[misc]
+        def effective_n_jobs(self, n_jobs: int) -> int:
+            """Calls under way: one a worker, at least two."""
+            return max(2, int(super().effective_n_jobs(n_jobs)))
+
+    return Cluster(client=client, wait_for_workers_timeout=CONNECT_S)
 
 
 def _require_one_thread(client: Any) -> None:

@@ -20,8 +20,8 @@ from study.errors import StudyError
 from study.evaluation.disturbances import KINDS, SEEDS, Disturbance, Level, levels
 from study.evaluation.robustness import ROBUST_METHODS, failed_rows, robustness_rows, robustness_summary
 from study.evaluation.sensitivity import Setting, sensitivity_rows, sensitivity_summary, settings
-from study.figures.canvas import png
-from study.figures.evidence import choices, robustness
+from study.figures.canvas import picture_files
+from study.figures.evidence import choice_pages, choices, robustness
 from study.files.atomic import json_text, sha256_of, write_bytes, write_json, write_text
 from study.methods import METHODS
 from study.methods.skeleton_graph import SkeletonGraphMethod
@@ -172,7 +172,14 @@ def run_evidence(
     for name in datasets_for_evidence() if plan.datasets is None else plan.datasets:
         dataset, folder = find_dataset(name, params), out / name
         if why_stale(Run(folder), dataset, plan.compared) is not None:
-            run_study(dataset, folder, methods=plan.compared, n_jobs=n_jobs, show_progress=show_progress)
+            run_study(
+                dataset,
+                folder,
+                methods=plan.compared,
+                n_jobs=n_jobs,
+                show_progress=show_progress,
+                keep_clouds=False,  # of more people than anybody looks at
+            )
         runs.append(Run(folder))
     return [*folders, *(run.folder for run in runs), *([_people(runs, out / PEOPLE)] if runs else [])]
 
@@ -236,10 +243,9 @@ def _robustness(plan: EvidencePlan) -> _Part:
         draws = found[["kind", "level", "draw", "method", "metric", "value", "status"]]
         refused = found.loc[found["reason"] != "", ["kind", "level", "draw", "method", "status", "reason"]]
         summary = robustness_summary(found)
-        pictures = {ROBUSTNESS: png(robustness(summary))}
-        in_plane = "true_waypoint_error_inplane"
-        pictures[f"{ROBUSTNESS}_inplane"] = png(robustness(summary, in_plane))
-        return {"summary": summary, "draws": draws, "refused": refused.drop_duplicates()}, pictures
+        in_plane = robustness(summary, "true_waypoint_error_inplane")
+        drawn = {ROBUSTNESS: robustness(summary), f"{ROBUSTNESS}_inplane": in_plane}
+        return {"summary": summary, "draws": draws, "refused": refused.drop_duplicates()}, picture_files(drawn)
 
     parameters = {
         "levels": [asdict(level) for level in plan.levels()],
@@ -264,7 +270,11 @@ def _sensitivity(plan: EvidencePlan) -> _Part:
         summary = sensitivity_summary(found)
         failed = found.loc[found["reason"] != "", ["choice", "option", "people", "seed", "reason"]]
         tables = {"summary": summary, "draws": wide.reset_index(), "refused": failed.drop_duplicates()}
-        return tables, {SENSITIVITY: png(choices(summary))}
+        pages = {
+            f"{SENSITIVITY}{f'_{k + 1}' * (k > 0)}": choices(summary, only)
+            for k, only in enumerate(choice_pages(summary))
+        }
+        return tables, picture_files(pages)
 
     parameters = {
         "settings": [asdict(one) for one in listed],
@@ -293,7 +303,7 @@ def _run_part(part: _Part, folder: Path, workers: Workers) -> Path:
         for name, table in tables.items():
             write_text(new / f"{name}.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.4f"))
         for name, picture in pictures.items():
-            write_bytes(new / f"{name}.png", picture)
+            write_bytes(new / name, picture)
         seconds = [f"{key},{outcome.seconds:.3f}\n" for key, outcome in outcomes.items()]  # no key holds a comma
         write_text(new / "timings.csv", "case,seconds\n" + "".join(seconds))
         record = provenance(part.name, part.parameters, 0, {}, started, datetime.now(UTC))

@@ -9,8 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from study.batch.cases import Work, all_rows, input_hashes
+from study.batch.cases import Work, all_cases, input_hashes
 from study.batch.workers import Workers
+from study.data.manifest import default_manifest_path
 from study.datasets import Dataset, find_dataset
 from study.errors import StudyError
 from study.files.atomic import sha256_of
@@ -23,6 +24,8 @@ from study.results.journal import Journal
 from study.results.metrics_csv import Row
 from study.results.provenance import arithmetic, provenance
 from study.results.run import Run, run_folder, write_run
+
+JOBS = "STUDY_JOBS"  # environment variable: how many processes a run that a notebook makes may have
 
 
 def run_dataset(
@@ -42,7 +45,9 @@ def run_dataset(
     Raises:
         StudyError: nobody to pair, or an unknown method; a person or pair that fails is rows instead.
     """
-    return all_rows(Work(dataset, Workers(n_jobs, show_progress), Journal(None, {})), chosen_methods(methods))
+    work = Work(dataset, Workers(n_jobs, show_progress), Journal(None, {}), keeps_clouds=False)
+    results = all_cases(work, chosen_methods(methods))
+    return results.rows, results.timings
 
 
 def chosen_methods(methods: Iterable[str] | None) -> list[str]:
@@ -67,6 +72,7 @@ def run_study(
     n_jobs: int = 1,
     show_progress: bool = False,
     scheduler: str | None = None,
+    keep_clouds: bool = True,
 ) -> Run:
     """Run a data set and put ``metrics.csv``, ``timings.csv``, ``provenance.json`` and tables into ``out``, at once.
 
@@ -79,6 +85,7 @@ def run_study(
         n_jobs: worker processes.
         show_progress: bars on standard error.
         scheduler: of a Dask cluster whose workers do it instead, as in ``tcp://127.0.0.1:8786``.
+        keep_clouds: what `study report --html` draws, about 50 kB a case.
 
     Raises:
         StudyError: as `run_dataset`; a folder that is not a run's or that another process is writing; or no case that
@@ -87,11 +94,13 @@ def run_study(
     chosen = chosen_methods(methods)
     dataset.pairs()  # nobody to pair leaves no folder
     with claimed(out) as claim:  # a folder that can't be written is better known now than after the run
-        _run_claimed(dataset, claim, chosen, Workers(n_jobs, show_progress, scheduler))
+        _run_claimed(dataset, claim, chosen, Workers(n_jobs, show_progress, scheduler), keep_clouds)
     return _with_values(Run(out))
 
 
-def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Workers) -> None:
+def _run_claimed(
+    dataset: Dataset, claim: Claim, methods: list[str], workers: Workers, keep_clouds: bool = True
+) -> None:
     started = datetime.now(UTC)
     basis = {
         **arithmetic(),
@@ -100,16 +109,19 @@ def _run_claimed(dataset: Dataset, claim: Claim, methods: list[str], workers: Wo
         "study": asdict(dataset.params),
         "seed": dataset.seed,
     }
-    work = Work(dataset, workers, Journal(claim.journal, basis))
-    rows, timings = all_rows(work, methods)
+    work = Work(dataset, workers, Journal(claim.journal, basis), keeps_clouds=keep_clouds)
+    results = all_cases(work, methods)
     inputs = {dataset.manifest.path.name: basis["manifest"]}
     inputs |= {key: sha256 for files in work.inputs.values() for key, sha256 in files.items()}
     parameters = run_parameters(dataset, methods)
     record = provenance(dataset.name, parameters, dataset.seed, inputs, started, datetime.now(UTC))
     record["peak_memory_mb"] = round(work.peak_mb)  # of one process; the timing rows have asked for every step
     record["code_sha256"] = basis["code_sha256"]  # that was run, whatever was edited since
+    record["own_manifest"] = (
+        dataset.manifest.path != default_manifest_path()
+    )  # whose people are no others' of the paper
     failures = [f"{' '.join(filter(None, step))}\n{trace}" for step, trace in work.traces.items()]
-    write_run(claim, rows, timings, record, "\n".join(failures), _made_with(dataset))
+    write_run(claim, results.rows, results.timings, record, "\n".join(failures), _made_with(dataset), results.clouds)
 
 
 def _made_with(dataset: Dataset) -> dict[str, Path]:
@@ -143,27 +155,49 @@ def why_stale(run: Run, dataset: Dataset, methods: Iterable[str] | None = None) 
     return run.why_stale(dataset.name, run_parameters(dataset, methods), dataset.seed, inputs)
 
 
-def open_run(dataset: str, profile: str = "full", seed: int = 0, *, show_progress: bool = False) -> Run:
+def split_methods(text: str) -> list[str] | None:
+    """Names of methods from one word, ``"icp,cpd"``; None, which stands for all, when it is empty."""
+    return [name.strip() for name in text.split(",")] if text else None
+
+
+def _n_jobs() -> int:
+    """Processes of a run that a notebook makes.
+
+    Raises:
+        StudyError: ``STUDY_JOBS`` is not a number of processes.
+    """
+    told = os.environ.get(JOBS, "")
+    if told and not (told.isdecimal() and int(told) > 0):
+        raise StudyError(f"{JOBS}: expected a number of processes, got {told!r}; unset it or give one from 1")
+    return int(told) if told else min(2, os.cpu_count() or 1)
+
+
+def open_run(
+    dataset: str, profile: str = "full", seed: int = 0, methods: str = "", *, show_progress: bool = False
+) -> Run:
     """The run of a data set: its folder's if the code, parameters and inputs of now made it, else a new one.
 
-    A run that another process is making is waited for.
+    A run that another process is making is waited for. A new one has as many processes as the environment variable
+    ``STUDY_JOBS`` says, which `study notebooks` sets for its notebooks; two, where there are as many cores, without it.
 
     Args:
-        dataset: name of a data set.
+        dataset: name of a data set, or the path of a manifest file.
         profile: ``"full"`` or ``"quick"``.
         seed: of the run.
+        methods: names with commas between, ``"icp,cpd"``, all when empty: a parameter that papermill can give.
         show_progress: bars on standard error.
 
     Raises:
         StudyError: as `run_study`.
     """
     chosen = find_dataset(dataset, find_profile(profile), seed)
-    folder = run_folder(chosen.name, profile, seed)
-    reason = why_stale(Run(folder), chosen)
+    those = split_methods(methods)
+    folder = run_folder(chosen.name, profile, seed, those)
+    reason = why_stale(Run(folder), chosen, those)
     if reason is not None:
         with claimed(folder, wait=True) as claim:
-            reason = why_stale(Run(folder), chosen)  # of now: who was waited for may have made it
+            reason = why_stale(Run(folder), chosen, those)  # of now: who was waited for may have made it
             if reason is not None:
-                _run_claimed(chosen, claim, chosen_methods(None), Workers(min(2, os.cpu_count() or 1), show_progress))
+                _run_claimed(chosen, claim, chosen_methods(those), Workers(_n_jobs(), show_progress))
     made = "loaded: code, parameters and seed are those of now" if reason is None else f"run now: {reason}"
     return _with_values(Run(folder, made))

@@ -89,7 +89,7 @@ class Workers:
             total=len(calls),
             desc=label,
             bar_format="{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed} so far, about {remaining} left",
-            mininterval=0.2 if sys.stderr.isatty() else 15,  # a log file needs a line now and then, not a moving bar
+            mininterval=bar_interval_s(),
             disable=not (self.show_progress and calls),
         )
         for number, outcome in bar:
@@ -127,6 +127,13 @@ class Workers:
                     f"--scheduler: expected the cluster at {scheduler} to go on, got {type(error).__name__} "
                     f"{' '.join(str(error).split())[:200]}; finished cases are kept: start again to go on"
                 ) from error
+
+
+def bar_interval_s() -> float:
+    """How often a bar may move: a log file needs a line now and then, a terminal or a notebook a moving bar."""
+    if sys.stderr.isatty():
+        return 0.2
+    return 1 if "ipykernel" in sys.modules else 15
 
 
 def attempt(function: Callable[..., Any], *arguments: Any) -> Outcome:

@@ -1,4 +1,4 @@
-"""The command line: data, run, compare, rerun, register, cloud, sweep, report."""
+"""The command line: data, run, notebooks, compare, rerun, register, cloud, landmarks, sweep, report."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import click
 
 from study import __version__
 from study.cli.comparing import compare, rerun
+from study.cli.notebooks import notebooks
 from study.cli.sweeping import sweep
 from study.errors import StudyError
 from study.offline import go_offline
@@ -38,6 +39,9 @@ def cli(context: click.Context, traceback: bool, offline: bool) -> None:
         context.obj["traceback"] = traceback
     if offline:
         go_offline()
+
+
+cli.add_command(notebooks)
 
 
 @cli.group()
@@ -97,6 +101,28 @@ def data_verify(dataset: str | None) -> None:
     table = verify_all(manifest, cohort)
     _print_files(table, dataset)
     click.get_current_context().exit(0 if (table["status"] == "verified").all() else 1)
+
+
+@data.command("init", short_help="Write a commented manifest for a folder of CTs.")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="Manifest to write.  [default: FOLDER/manifest.yaml]"
+)
+def data_init(folder: Path, out: Path | None) -> None:
+    """Write a commented manifest for a folder of CTs, with the labels or landmarks beside them."""
+    from study.data.draft import draft_manifest
+    from study.data.manifest import load_manifest
+    from study.files.atomic import write_text
+
+    out = out or folder / "manifest.yaml"
+    if out.exists():
+        raise StudyError(f"expected a new file, got {out}, which is there; delete it or give another name by --out")
+    text, absent = draft_manifest(folder, out)
+    write_text(out, text)
+    cohort = next(iter(load_manifest(out).cohorts.values()))
+    click.echo(f"{len(cohort.subjects)} CTs: {out}; look it over, then `study run --dataset {out}`")
+    if absent:
+        click.echo(f"study: warning: without labels or landmarks: {', '.join(absent)}; see `study landmarks`", err=True)
 
 
 @cli.command("datasets", short_help="Print the names of the data sets.")
@@ -169,7 +195,8 @@ def _report(run: Run) -> None:
     for table in run.tables():
         click.echo(f"\n{table.read_text(encoding='utf-8')}")
     if not run.values.empty:
-        click.echo("Waypoint errors, mm (sec. IV-B; paper: its own volunteer, other data)\n")
+        beside = "" if run.own_manifest else "; paper: its own volunteer, other data"
+        click.echo(f"Waypoint errors, mm (sec. IV-B{beside})\n")
         click.echo(run.waypoint_summary().round(2).to_string(index=False, na_rep="-"))
     for (source, target, reason), cases in run.failures.groupby(["source", "target", "reason"], sort=False):
         click.echo(f"{source} to {target}, {', '.join(cases['method'])}: failed: {reason}")
@@ -180,12 +207,23 @@ def _report(run: Run) -> None:
     click.echo(f"metrics, tables and provenance: {run.folder}")
 
 
-@cli.command()
-@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
-def report(folder: Path) -> None:
-    """Print the tables of every run under FOLDER."""
+@cli.command(short_help="Print the tables of finished runs, or write all of it as pages.")
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False), default="results/runs")
+@click.option(
+    "--html", is_flag=True, help="Write FOLDER/report/index.html, which needs no network, and print its path."
+)
+@click.option("--dataset", metavar="a,b", help="With --html: only these; every reported one when left out.")
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(min=1), help="Worker processes of --html.")
+def report(folder: Path, html: bool, dataset: str | None, jobs: int) -> None:
+    """Print the tables of every run under FOLDER (results/runs when left out), or write its pages."""
     from study.results.run import find_runs, visible
 
+    if html:
+        from study.report import write_report
+
+        chosen = None if dataset is None else [name.strip() for name in dataset.split(",")]
+        click.echo(f"report: {write_report(folder, chosen, n_jobs=jobs, show_progress=True)}")
+        return
     for run in find_runs(folder):
         click.echo(f"\n## {run.folder.relative_to(folder)}")
         _report(run)
@@ -233,7 +271,7 @@ cli.add_command(sweep)
     show_default=True,
     help="A name in METHODS; the default is the paper's, gaussian_process has the smallest true error.",
 )
-@click.option("--waypoints", type=click.Path(path_type=Path), help="CSV with columns x, y, z: mm in the CT frame.")
+@click.option("--waypoints", type=click.Path(path_type=Path), help="Of the CT frame, mm: .csv, .mrk.json or .fcsv.")
 @click.option(
     "--radius",
     default=20.0,
@@ -242,49 +280,63 @@ cli.add_command(sweep)
     metavar="MM",
     help="Sphere around a waypoint whose points carry it.",
 )
-@click.option("--front", metavar="X,Y,Z", help="Direction from the chest to the probe, in the frame of US.")
+@click.option("--front", metavar="X,Y,Z", help="Direction from the chest to the probe, in the frame of US, RAS.")
+@click.option("--field", metavar="GRID|MM", help="Displacement field too, on an image's grid (US frame) or of MM.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of results.")
 def register(
-    ct: Path, us: Path, method: str, waypoints: Path | None, radius: float, front: str | None, seed: int, out: Path
+    ct: Path,
+    us: Path,
+    method: str,
+    waypoints: Path | None,
+    radius: float,
+    front: str | None,
+    field: str | None,
+    seed: int,
+    out: Path,
 ) -> None:
     """Register two clouds of one's own (PLY, mm, any rigid pose): sternum and cartilages 2-5, nothing else.
 
     A property "time" of US's vertices says when each was seen, in seconds; methods that know of breathing use it.
+    A comment SPACE=LPS in a PLY file is heeded. docs/formats.md says what is read and written; files of an earlier
+    registration in OUT are replaced, other files stay.
     """
-    from study.files.clouds import NOT_CARRIED, read_ply, read_timed_ply, read_waypoints, write_registration
-    from study.pipeline import find_method, register_pair
+    from study.files.register_files import register_files
 
-    find_method(method)
-    path = None if waypoints is None else read_waypoints(waypoints)
-    towards = None if front is None else _direction(front)
-    person, (seen, times) = read_ply(ct), read_timed_ply(us)
-    result = register_pair(person, seen, method=method, seed=seed, front=towards, times=times)
-    for line in write_registration(result, out, path, radius):
-        if line.startswith(NOT_CARRIED):
-            click.echo(f"study: warning: {line}", err=True)
-        else:
-            click.echo(line)
-    for warning in [*result.warnings, *([] if result.converged else [f"not converged: {result.stop_reason}"])]:
+    towards = None if front is None else _numbers(front, "--front", "X,Y,Z", 3)
+    lines, warnings = register_files(
+        ct, us, out, method=method, waypoints=waypoints, radius_mm=radius, front=towards, seed=seed, field=field
+    )
+    for line in lines:
+        click.echo(line)
+    for warning in warnings:
         click.echo(f"study: warning: {warning}", err=True)
 
 
-def _direction(text: str) -> list[float]:
-    """Three numbers of an option."""
+def _numbers(text: str, option: str, shape: str, n: int) -> list[float]:
+    """The numbers of an option, as many as it has."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != 3:
-        raise StudyError(f"--front: expected three numbers as in 0,1,0, got {text!r}; give it as X,Y,Z")
+    if len(numbers) != n:
+        raise StudyError(
+            f"{option}: expected {n} numbers as in {','.join('012'[:n])}, got {text!r}; give it as {shape}"
+        )
     return numbers
 
 
 @cli.command(short_help="Cartilage cloud of a CT of one's own.")
 @click.argument("ct", type=click.Path(path_type=Path))
-@click.option("--labels", type=click.Path(path_type=Path), help="Label volume on the CT's grid.")
+@click.option(
+    "--labels",
+    type=click.Path(path_type=Path),
+    help="Label volume on the CT's grid, or a folder of masks as TotalSegmentator writes it.",
+)
 @click.option("--label-map", default="totalsegmentator_v2", show_default=True, help="Names of the label ids.")
-@click.option("--landmarks", type=click.Path(path_type=Path), help="Landmark file, as in annotations/.")
+@click.option(
+    "--landmarks", type=click.Path(path_type=Path), help="Landmark file as in annotations/, or Slicer's points."
+)
 @click.option("--points", default=9000, show_default=True, type=click.IntRange(min=500))
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Cloud to write, .ply.")
@@ -303,6 +355,57 @@ def cloud(
     anatomy = read_anatomy(ct, points, rng, labels=labels, ids=ids, landmarks=landmarks)
     write_ply(anatomy.cloud, out)
     click.echo(f"{len(anatomy.cloud)} points of sternum and cartilages 2-5, mm RAS+: {out}")
+
+
+@cli.command(short_help="Pictures and places for the landmarks of a CT.")
+@click.argument("ct", type=click.Path(path_type=Path))
+@click.option("--pick", "picks", multiple=True, metavar="X,Z", help="Place in the front view; may be given many times.")
+@click.option(
+    "--slice", "heights", multiple=True, type=float, metavar="Z", help="Axial slice to draw; may be repeated."
+)
+@click.option("--check", type=click.Path(path_type=Path), help="Landmark file, or Slicer's points: draw what grows.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder of pictures.")
+def landmarks(
+    ct: Path, picks: tuple[str, ...], heights: tuple[float, ...], check: Path | None, out: Path | None
+) -> None:
+    """Draw the front of a chest, turn picks in it into millimetres, and check a landmark file.
+
+    \b
+    study landmarks CT --out pictures                      front.png, to read x and z from
+    study landmarks CT --pick 33.5,-85.6 --pick -30,-86    x, y, z of places in it, a line each
+    study landmarks CT --slice -120 --out pictures         slices.png, to read x and y from
+    study landmarks CT --check mine.yaml --out pictures    check-front.png and check-panels.png: what grows from it
+    """
+    from study.ct.growth import parts_from_landmarks
+    from study.ct.wall import anterior_wall_image
+    from study.figures.canvas import png
+    from study.figures.landmarks import axial_slices, chest_front, landmark_panels
+    from study.files.atomic import write_bytes
+    from study.files.landmarks import read_landmarks
+    from study.files.volumes import read_volume
+
+    if out is None and (heights or check or not picks):
+        raise StudyError("expected --out, the folder of the pictures, got none; add it, or ask for --pick X,Z alone")
+    places = [_numbers(pick, "--pick", "X,Z", 2) for pick in picks]
+    placed = None if check is None else read_landmarks(check)
+    image = read_volume(ct)
+    wall = anterior_wall_image(image)
+    for x, z in places:
+        click.echo("[{:.1f}, {:.1f}, {:.1f}]".format(*wall.pick(x, z)))
+    if out is None:
+        return
+    figures = {}
+    if heights:
+        figures["slices"] = axial_slices(image, heights)
+    if placed is not None:
+        grown = parts_from_landmarks(image, placed)
+        figures["check-front"] = chest_front(wall, placed, grown)
+        figures["check-panels"] = landmark_panels(image, placed, grown)
+    if not figures:
+        figures["front"] = chest_front(wall)
+    for name, figure in figures.items():
+        write_bytes(out / f"{name}.png", png(figure))
+        click.echo(out / f"{name}.png")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

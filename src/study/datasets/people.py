@@ -14,7 +14,7 @@ from study.ct.surface import sample_cloud, surface
 from study.errors import StudyError
 from study.evaluation.waypoints import intercostal_waypoints
 from study.files.landmarks import read_landmarks
-from study.files.volumes import read_labels, read_volume
+from study.files.volumes import masks_in, read_labels, read_masks, read_volume
 from study.naming import sweep_name
 from study.params import StudyParams
 from study.phantom.deformation import Deformation
@@ -106,8 +106,8 @@ def read_anatomy(
         ct: image file, or folder of a DICOM series.
         n_points: of the cloud.
         rng: of the samples.
-        labels: label volume on the CT's grid. Cartilage is taken from it where ``ids`` names it, else grown between
-            the ribs' ends and the sternum.
+        labels: label volume on the CT's grid, or a folder of masks named after structures. Cartilage is taken from it
+            where ``ids`` names it and the folder has it, else grown between the ribs' ends and the sternum.
         ids: label id of each structure.
         landmarks: landmark file instead of labels.
 
@@ -122,7 +122,10 @@ def read_anatomy(
         mask = parts_from_landmarks(image, read_landmarks(landmarks))
     else:
         ids = ids or {}
-        volume = read_labels(labels, image)
+        if labels.is_dir():
+            volume, ids = read_masks(masks_in(labels, ids), image)
+        else:
+            volume = read_labels(labels, image)
         mask = parts_from_labels(volume, ids) if "costal_cartilages" in ids else parts_from_ribs(image, volume, ids)
     return anatomy_of(image.name, image, mask, n_points, rng)
 

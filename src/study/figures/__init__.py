@@ -15,6 +15,7 @@ from study.figures import (
     distributions,
     evidence,
     graphs,
+    landmarks,
     registration,
     style,
     ultrasound,
@@ -28,6 +29,7 @@ from study.figures.controls import *
 from study.figures.distributions import *
 from study.figures.evidence import *
 from study.figures.graphs import *
+from study.figures.landmarks import *
 from study.figures.registration import *
 from study.figures.style import *
 from study.figures.ultrasound import *
@@ -42,6 +44,7 @@ __all__ = [
     *distributions.__all__,
     *evidence.__all__,
     *graphs.__all__,
+    *landmarks.__all__,
     *registration.__all__,
     *style.__all__,
     *ultrasound.__all__,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,13 +23,14 @@ from study.figures.canvas import (
     name_parts,
     new_figure,
     part_legend,
+    plain,
     project,
     require,
 )
-from study.figures.style import CT_COLOUR, DARK, US_COLOUR, part_colours
+from study.figures.style import CT_COLOUR, DARK, US_COLOUR, part_colours, steps
 from study.types import Floats, Ints, RigidTransform
 
-__all__ = ["CoarseView", "coarse_overlay", "coarse_steps"]
+__all__ = ["CoarseView", "ScoreView", "coarse_overlay", "coarse_steps", "score_maps"]
 
 _EDGE_COLOUR, _SEED_COLOUR = "#882255", "#F0E442"
 _SCALE_STYLE = (("#555555", 3.5), ("#56B4E9", 2.2), ("#D55E00", 1.6))  # colour and line width, coarse to fine
@@ -88,6 +90,76 @@ def coarse_steps(views: Mapping[str, CoarseView]) -> Figure:
     edge = Line2D([], [], color=_EDGE_COLOUR, lw=1.6, label="edge of the sternum")
     seed = Line2D([], [], ls="", marker="*", ms=9, color=_SEED_COLOUR, mec="black", mew=0.7, label="seed of a branch")
     part_legend(figure, [*(scales[scale] for scale in sorted(scales, reverse=True)), edge, seed])
+    return figure
+
+
+@dataclass(frozen=True)
+class ScoreView:
+    """The template match of Eq. 1 for one cloud, as a picture.
+
+    Attributes:
+        values: (w, h) F_k over the rectangle's area, 0-1, with the template's centre at each pixel.
+        origin: (2,) mm, the centre of the first pixel.
+        pixel_mm: edge of a pixel.
+        angles_deg: (a,) rotations tried.
+        best: (a,) the largest F_k at each.
+        plane: (n, 2) mm, the cloud in its feature plane.
+        centre: (2,) mm, of the rectangle found.
+        angle_deg: its rotation, counter-clockwise from y.
+        size_mm: width and height of the rectangle.
+    """
+
+    values: Floats
+    origin: Floats
+    pixel_mm: float
+    angles_deg: Floats
+    best: Floats
+    plane: Floats
+    centre: Floats
+    angle_deg: float
+    size_mm: tuple[float, float] = (30.0, 90.0)
+
+
+def score_maps(views: Mapping[str, ScoreView]) -> Figure:
+    """The map of F_k in the paper's Fig. 2: where the sternum's template covers the cloud, and at which rotation.
+
+    Args:
+        views: by the cloud's name.
+
+    Raises:
+        StudyError: no view.
+    """
+    require(views, "views")
+    figure = new_figure(0.9 + 3.0 * len(views), "Template match: $F_k$ of Eq. 1 over the area of the rectangle")
+    drawn: Any = None
+    grid = figure.subplots(len(views), 3, squeeze=False, width_ratios=[1, 1, 1.1])
+    for row, (name, view) in zip(grid, views.items(), strict=True):
+        low = view.origin - view.pixel_mm / 2
+        high = low + view.pixel_mm * np.array(view.values.shape)
+        extent = (low[0], high[0], low[1], high[1])
+        row[0].scatter(*view.plane.T, s=1.5, c="#9db2c4", lw=0, rasterized=True)
+        drawn = row[1].imshow(
+            view.values.T, origin="lower", extent=extent, cmap=steps("viridis"), vmin=0, vmax=1, interpolation="nearest"
+        )
+        titles = (f"{name}: the cloud in its plane", f"$F_k$ at {view.angle_deg:.0f}°, {view.pixel_mm:g} mm a pixel")
+        for ax, colour, title in zip(row, (DARK, "white"), titles, strict=False):
+            c, s = np.cos(np.radians(view.angle_deg)), np.sin(np.radians(view.angle_deg))
+            half = np.array(view.size_mm) / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+            ax.add_patch(Polygon(half @ np.array([[c, s], [-s, c]]) + view.centre, fill=False, ec=colour, lw=1.8))
+            ax.plot(*view.centre, marker="+", ms=10, mew=2, color=colour)
+            ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
+            plain(ax, title)
+            ax.set_xlabel("x in the plane (mm)", fontsize=8)
+        row[0].set_ylabel("y in the plane (mm)", fontsize=8)
+        row[2].plot(view.angles_deg, view.best, marker="o", ms=4, color=US_COLOUR)
+        row[2].axvline(view.angle_deg, color=_EDGE_COLOUR, lw=1.2)
+        row[2].set_ylim(0, 1.02)
+        row[2].set_xlabel("rotation of the template (°)", fontsize=8)
+        row[2].grid(alpha=0.25)
+        plain(row[2], "largest $F_k$ at each rotation")
+    bar = figure.colorbar(drawn, ax=grid[:, 1], shrink=min(0.9, 3.0 / figure.get_figheight()), aspect=20, pad=0.02)
+    bar.set_label("share of the rectangle that is covered", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
     return figure
 
 

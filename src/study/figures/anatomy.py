@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
 from study.errors import StudyError
 from study.figures.canvas import (
     WIDTH_IN,
+    below,
     bounds,
     dots,
     draw_surface,
@@ -22,14 +25,16 @@ from study.figures.canvas import (
     name_parts,
     new_figure,
     part_legend,
+    plain,
     project,
     require,
 )
 from study.figures.style import PART_COLOUR, part_colours
-from study.types import Floats, Ints, Mesh, Part, PointCloud, RigidTransform, Volume
+from study.types import CARTILAGES, Bools, Floats, Ints, Mesh, Part, PointCloud, RigidTransform, Volume
 
-__all__ = ["anatomy_overview", "ct_slice", "mesh_and_cloud"]
+__all__ = ["FrontWall", "anatomy_overview", "biomarker", "ct_slice", "front_wall", "mesh_and_cloud"]
 
+_STERNUM, _CARTILAGE = "#56B4E9", "#E69F00"  # Okabe and Ito
 _DRAWN: Mapping[Part, Any] = {part: colour for part, colour in PART_COLOUR.items() if part != Part.UNKNOWN}
 
 
@@ -151,17 +156,159 @@ def _part_contours(ax: Axes, xy: Sequence[Floats], parts: Ints, colours: Mapping
 
 
 def _grey_image(ax: Axes, values: ArrayLike, x: Floats, y: Floats, window: tuple[float, float]) -> None:
-    """``values[i, j]`` at x[i], y[j]; both rise or both axes are turned so that they do."""
+    """``values[i, j]`` at x[i], y[j]; both rise or both axes are turned so that they do. 48 greys keep a PNG small."""
     dx, dy = abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2
     extent = (x.min() - dx, x.max() + dx, y.min() - dy, y.max() + dy)
-    image = np.asarray(values)[np.argsort(x)][:, np.argsort(y)].T
-    ax.imshow(image, cmap="gray", vmin=window[0], vmax=window[1], extent=extent, origin="lower", rasterized=True)
+    low, high = window
+    image = np.clip((np.asarray(values)[np.argsort(x)][:, np.argsort(y)].T - low) / (high - low), 0.0, 1.0)
+    _area(ax, np.round(image * 47) / 47, extent, cmap="gray", vmin=0.0, vmax=1.0)
+
+
+def _area(ax: Axes, image: Floats, extent: tuple[float, float, float, float], **style: Any) -> None:
+    ax.imshow(image, extent=extent, origin="lower", interpolation="nearest", **style)
 
 
 def _best_slice(mask: Volume, axis: int) -> int:
     """The slice that shows most: many parts count as much as large ones, hence the root of each part's area."""
     planes = np.moveaxis(mask.values, axis, 0).reshape(mask.shape[axis], -1)
     return int(np.argmax(np.sum([np.sqrt((planes == part).sum(axis=1)) for part in _DRAWN], axis=0)))
+
+
+@dataclass(frozen=True)
+class FrontWall:
+    """The front wall of a chest, flattened along front to back, so that a curved cartilage is seen whole.
+
+    Attributes:
+        image: (rows, columns) mean density of the sheet in front of the lungs, HU.
+        x_mm: (columns,) R is positive.
+        z_mm: (rows,) upwards.
+        name: of the subject.
+    """
+
+    image: Floats
+    x_mm: Floats
+    z_mm: Floats
+    name: str
+
+
+def front_wall(
+    wall: FrontWall, mask: Volume, *, reference: Volume | None = None, window_hu: tuple[float, float] = (-30.0, 110.0)
+) -> Figure:
+    """The unrolled front of a chest with the outline of each part: sternum, cartilages and ribs side by side.
+
+    Args:
+        wall: see `study.ct.wall.anterior_wall_image`.
+        mask: `Part` values, axes along R, A, S.
+        reference: other parts, dashed.
+        window_hu: darkest and brightest value.
+
+    Raises:
+        StudyError: an empty mask.
+    """
+    extent = _seen_of(mask, 22.0)
+    wide, tall = np.ptp(extent, axis=0)
+    width_in = 8.0
+    figure = new_figure(0.9 + width_in * tall / wide, f"{wall.name}: parts on the unrolled front of the chest")
+    ax = figure.subplots()
+    _draw_wall(ax, wall, extent, window_hu)
+    _silhouettes(ax, mask, _DRAWN, linewidths=1.5)
+    if reference is not None:
+        white: Mapping[Part, Any] = dict.fromkeys(_DRAWN, "white")
+        _silhouettes(ax, reference, white, linewidths=0.9, linestyles="dashed")
+    look(ax, "front", extent, "mean density of the sheet in front of the lungs", on_dark=True)
+    part_legend(figure)
+    return figure
+
+
+def biomarker(wall: FrontWall, mask: Volume, frames: Mapping[str, Floats], size_mm: tuple[float, float]) -> Figure:
+    """The paper's Fig. 1: where bone becomes cartilage, the three types, and frames of cartilage and rib.
+
+    Args:
+        wall: of a CT.
+        mask: its `Part` values, axes along R, A, S.
+        frames: by what they show, grey values (rows, columns) 0-1, as `study.ultrasound.b_mode_like` gives them.
+        size_mm: width and depth of a frame.
+
+    Raises:
+        StudyError: an empty mask or no frame.
+    """
+    require(frames, "frames")
+    extent = _seen_of(mask, 34.0)
+    figure = new_figure(7.6, f"{wall.name}: bone, cartilage and where they meet; the frames are simulated")
+    grid = figure.add_gridspec(2, 2, height_ratios=[1.25, 1])
+    top = [figure.add_subplot(grid[0, k]) for k in (0, 1)]
+    for ax in top:
+        _draw_wall(ax, wall, extent, (-30.0, 110.0))
+    ends = _junctions(mask)
+    top[0].scatter(ends[:, 0], ends[:, 1], s=130, fc="none", ec="#F0E442", lw=1.8)
+    look(top[0], "front", extent, "a  front of the chest on CT; ringed: junctions of rib and cartilage", on_dark=True)
+    _fill(top[1], mask)
+    middle = float(ends[:, 0].mean())
+    words: dict[str, Any] = {"color": "white", "fontsize": 9, "weight": "bold", "ha": "center", "va": "center"}
+    for x, y in ends:
+        halo = [withStroke(linewidth=2, foreground="black")]
+        top[1].text(x + 16 * np.sign(x - middle), y + 4, "rib", path_effects=halo, **words)
+    look(top[1], "front", extent, "b  the three types", on_dark=True)
+    for k, (what, frame) in enumerate(frames.items()):
+        ax = figure.add_subplot(grid[1, k])
+        seen = np.round(np.asarray(frame) * 23) / 23  # few greys keep a PNG of speckle small
+        ax.imshow(seen, cmap="gray", vmin=0, vmax=1, extent=(0, size_mm[0], size_mm[1], 0), interpolation="nearest")
+        ax.set_xlabel("along the aperture (mm)", fontsize=8)
+        ax.set_ylabel("depth (mm)", fontsize=8)
+        plain(ax, f"{'cd'[k]}  {what}, B-mode-like, simulated from the CT")
+    below(figure, [Patch(color=c, label=n) for n, c in (("sternum", _STERNUM), ("costal cartilage", _CARTILAGE))], 2)
+    return figure
+
+
+def _draw_wall(ax: Axes, wall: FrontWall, extent: Floats, window_hu: tuple[float, float]) -> None:
+    """The wall's image, no more of it than is shown."""
+    x = -wall.x_mm
+    columns = np.flatnonzero((x >= extent[0, 0] - 2) & (x <= extent[1, 0] + 2))
+    rows = np.flatnonzero((wall.z_mm >= extent[0, 1] - 2) & (wall.z_mm <= extent[1, 1] + 2))
+    _grey_image(ax, wall.image[np.ix_(rows, columns)].T, x[columns], wall.z_mm[rows], window_hu)
+
+
+def _seen_of(mask: Volume, margin_mm: float) -> Floats:
+    """(2, 2) mm, corners of what is shown: across and up the page."""
+    require(np.flatnonzero(mask.values >= 0), f"labelled voxels of {mask.name}")
+    flat = np.asarray((mask.values >= 0).any(axis=1))
+    seen = [(-1) ** (a == 0) * _grid_mm(mask, a)[flat.any(axis=b)] for a, b in ((0, 1), (2, 0))]
+    return np.array([[one.min() - margin_mm for one in seen], [one.max() + margin_mm for one in seen]])
+
+
+def _silhouette(mask: Volume, part: Part) -> Bools:
+    return np.asarray((mask.values == part).any(axis=1))
+
+
+def _silhouettes(ax: Axes, mask: Volume, colours: Mapping[Part, Any], **style: Any) -> None:
+    """The outline of each part seen from the front."""
+    xy = [-_grid_mm(mask, 0), _grid_mm(mask, 2)]
+    for part, colour in colours.items():
+        flat = np.where(_silhouette(mask, part), int(part), int(Part.UNKNOWN))
+        _part_contours(ax, xy, flat, {part: colour}, **style)
+
+
+def _fill(ax: Axes, mask: Volume) -> None:
+    """Sternum and cartilages as areas."""
+    x, z = -_grid_mm(mask, 0), _grid_mm(mask, 2)
+    edges = (x.min(), x.max(), z.min(), z.max())
+    cartilage = np.any([_silhouette(mask, part) for part in CARTILAGES], axis=0)
+    for inside, colour in ((_silhouette(mask, Part.STERNUM), _STERNUM), (cartilage, _CARTILAGE)):
+        area = np.where(inside, 1.0, np.nan)[np.argsort(x)].T
+        _area(ax, area, edges, cmap=ListedColormap([colour]), alpha=0.8)
+
+
+def _junctions(mask: Volume) -> Floats:
+    """(8, 2) across and up the page: the end of each cartilage that is farthest from the sternum."""
+    x, z = -_grid_mm(mask, 0), _grid_mm(mask, 2)
+    middle = x[_silhouette(mask, Part.STERNUM).any(axis=1)].mean()
+    ends = []
+    for part in CARTILAGES:
+        i, k = np.nonzero(_silhouette(mask, part))
+        if len(i):
+            outer = np.argsort(np.abs(x[i] - middle))[-max(1, len(i) // 50) :]
+            ends.append([x[i[outer]].mean(), z[k[outer]].mean()])
+    return np.array(ends)
 
 
 def anatomy_overview(

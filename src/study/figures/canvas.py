@@ -7,11 +7,12 @@ patient's right is therefore on the viewer's left.
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
@@ -21,13 +22,15 @@ from numpy.typing import ArrayLike
 from PIL import Image
 
 from study.errors import StudyError
-from study.figures.style import DARK, GREY, LEVEL_COLOUR, PART_COLOUR, method_style
+from study.figures.style import DARK, GREY, LEVEL_COLOUR, PART_COLOUR
 from study.geometry.points import nearest
 from study.types import CARTILAGES, Floats, Ints, Part, RigidTransform, as_points
 
-__all__ = ["T_RAS_CHEST", "StudyFigure", "png"]
+__all__ = ["T_RAS_CHEST", "StudyFigure", "picture_files", "png", "svg"]
 
-DPI, WIDTH_IN = 90, 11.0  # 990 pixels: the width of a notebook's cell
+DPI, WIDTH_IN = 150, 11.0
+TALLEST_IN = 9.3  # 1,395 pixels: a figure is seen whole on a screen
+SHOWN_DPI = 90  # 990 pixels: the width of a notebook's cell; the others are for large screens and print
 MAX_DOTS = 5000  # more dots of a cloud only make the file larger
 
 # RAS+ to chest coordinates, for what is given in no other frame.
@@ -39,8 +42,9 @@ View = Literal["front", "side"]
 class StudyFigure(Figure):
     """A figure that a notebook shows by itself, at its own resolution, the same bytes every time."""
 
-    def _repr_png_(self) -> bytes:
-        return png(self)
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        wide, tall = self.get_size_inches() * SHOWN_DPI
+        return png(self), {"width": round(wide), "height": round(tall)}
 
 
 def png(figure: Figure) -> bytes:
@@ -64,13 +68,28 @@ def png(figure: Figure) -> bytes:
     image = Image.fromarray(index[place].reshape(pixels.shape[:2]).astype(np.uint8), mode="P")
     image.putpalette(palette.astype(np.uint8).tobytes())
     buffer = io.BytesIO()
-    image.save(buffer, format="png", optimize=True)
+    image.save(buffer, format="png", optimize=True, dpi=(figure.dpi, figure.dpi))
     return buffer.getvalue()
 
 
+def svg(figure: Figure) -> bytes:
+    """A figure as SVG, for print; the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    with rc_context({"svg.hashsalt": "study"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def picture_files(drawn: Mapping[str, Figure]) -> dict[str, bytes]:
+    """Each figure as the files that are kept of it, PNG and SVG, by file name."""
+    return {
+        f"{name}.{kind}": made(figure) for name, figure in drawn.items() for kind, made in (("png", png), ("svg", svg))
+    }
+
+
 def new_figure(height_in: float, title: str) -> StudyFigure:
-    """A figure of the notebook's width."""
-    figure = StudyFigure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
+    """A figure of the notebook's width, no taller than a screen."""
+    figure = StudyFigure(figsize=(WIDTH_IN, min(height_in, TALLEST_IN)), dpi=DPI, layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=12)
     return figure
 
@@ -192,13 +211,3 @@ def part_legend(figure: Figure, extra: Sequence[Any] = (), shown: Collection[Par
     left = [part for part in CARTILAGES if part in shown and part.side == "left"]
     handles += [Patch(color=PART_COLOUR[part], label="patient's left: lighter") for part in left[:1]]
     below(figure, [*handles, *extra], 6 if not extra else 5)
-
-
-def method_legend(figure: Figure, methods: Sequence[str], extra: Sequence[Any] = ()) -> None:
-    """Methods below the figure, as bars and boxes are filled."""
-    handles: list[Any] = []
-    for method in methods:
-        style = method_style(method)
-        handles.append(Patch(facecolor=style.face, edgecolor=style.edge, hatch=style.hatch, label=style.label))
-    columns = min(len(handles) + len(extra), 5)
-    below(figure, [*handles, *extra], columns)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,11 @@ from matplotlib.patches import Patch
 from study.evaluation.pair import in_order
 from study.evaluation.statistics import population_sd
 from study.figures.canvas import below, new_figure, plain, require, require_columns
-from study.figures.rows import method_row, name_rows, spread, stripe_rows
-from study.figures.style import DARK, GREY, SIMULATED, MethodStyle, method_style
+from study.figures.rows import judged_by, method_row, name_rows, spread, stripe_rows
+from study.figures.style import DARK, DATASET_STYLE, GREY, SIMULATED, MethodStyle, method_style
 from study.types import Floats
 
-__all__ = ["error_budget", "paired_differences", "sensitivity", "way"]
+__all__ = ["difference_rows", "error_budget", "paired_differences", "sensitivity", "way"]
 
 _YARDSTICK_COLOUR = "#e8e8e8"
 
@@ -128,12 +129,12 @@ def _signed(value: float) -> str:
 
 
 def error_budget(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
-    """What each error of the ultrasound does to the cloud and, by method, to the waypoints.
+    """What each error of the ultrasound does to the cloud and, a panel a family of methods, to the waypoints.
 
     Args:
         df: long, columns ``error`` (in the order to show), ``metric`` (``surface_distance`` of the
-            cloud or ``waypoint_error``), ``method`` (ignored for the cloud) and ``value`` (mm); several rows of one
-            kind (seeds, patients) are dots about their mean.
+            cloud or ``waypoint_error``), ``method`` (ignored for the cloud) and ``value`` (mm); of several rows of one
+            kind (seeds, patients) the range is a line about their mean.
         note: where the patient is from.
 
     Raises:
@@ -143,24 +144,31 @@ def error_budget(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     cloud, path = (df[df["metric"] == metric] for metric in ("surface_distance", "waypoint_error"))
     require(cloud, "rows of surface_distance")
     require(path, "rows of waypoint_error")
-    errors, methods = list(dict.fromkeys(df["error"])), in_order(path["method"])
-    figure = new_figure(1.5 + 0.46 * len(errors), f"What each error of the ultrasound costs ({note})")
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=[1, 1.9])
-    _strip(left, errors, cloud, 0.0, MethodStyle("", DARK, "o", tuned=True))
-    for k, method in enumerate(methods):
-        style = method_style(method)
-        aside = 0.62 * ((k + 0.5) / len(methods) - 0.5)
-        _strip(right, errors, path[path["method"] == method], aside, style)
-    for ax, title in ((left, "cloud to the true surface, mean (mm)"), (right, "mean waypoint error (mm)")):
+    errors = list(dict.fromkeys(df["error"]))
+    families: dict[str, list[str]] = {}
+    for method in in_order(path["method"]):
+        families.setdefault(method_style(method).label.partition(",")[0], []).append(method)
+    figure = new_figure(1.6 + 0.3 * len(errors), f"What each error of the ultrasound costs ({note})")
+    panels = np.atleast_1d(figure.subplots(1, 1 + len(families), sharey=True))
+    _strip(panels[0], errors, cloud, 0.0, MethodStyle("", DARK, "o", tuned=True))
+    for ax, methods in zip(panels[1:], families.values(), strict=True):
+        for k, method in enumerate(methods):
+            aside = 0.4 * ((k + 0.5) / len(methods) - 0.5)
+            _strip(ax, errors, path[path["method"] == method], aside, method_style(method))
+        if ax is not panels[1]:
+            ax.sharex(panels[1])
+    for ax, title in zip(panels, ("the cloud itself", *families), strict=True):
         stripe_rows(ax, len(errors))
-        ax.set_xlabel(title, fontsize=9)
         ax.set_xlim(0, None)
         ax.grid(axis="x", alpha=0.3)
-        plain(ax)
-    name_rows(left, errors)
-    styles = [method_style(method) for method in methods]
-    marks = [Line2D([], [], ls="", marker=s.marker, mfc=s.face, mec=s.edge, label=s.label) for s in styles]
-    below(figure, marks, min(5, len(marks)))
+        plain(ax, title)
+        ax.set_xlabel(
+            "mean waypoint error (mm)" if ax is not panels[0] else "to the true surface, mean (mm)", fontsize=8
+        )
+    name_rows(panels[0], errors)
+    looks = (("#ffffff", GREY, "pale: as published or shipped"), (GREY, "#000000", "solid: tuned"))
+    marks = [Line2D([], [], ls="", marker="o", mfc=face, mec=edge, label=label) for face, edge, label in looks]
+    below(figure, marks, 2)
     return figure
 
 
@@ -169,11 +177,51 @@ def _strip(ax: Axes, errors: Sequence[str], rows: pd.DataFrame, aside: float, st
     for y, error in enumerate(errors):
         values = rows.loc[rows["error"] == error, "value"].dropna().to_numpy()
         if len(values) > 1:
-            ax.plot([values.min(), values.max()], [y + aside] * 2, color=style.colour, lw=1, alpha=0.6)
-            ax.scatter(values, np.full(len(values), y + aside), s=6, c=style.colour, lw=0, alpha=0.6)
+            ax.plot([values.min(), values.max()], [y + aside] * 2, color=style.colour, lw=1.2, alpha=0.7)
         if len(values):
             look: dict[str, Any] = {"marker": style.marker, "fc": style.face, "ec": style.edge}
-            ax.scatter(values.mean(), y + aside, s=38, lw=1.1, zorder=4, **look)
+            ax.scatter(values.mean(), y + aside, s=34, lw=1.0, zorder=4, **look)
+
+
+def difference_rows(df: pd.DataFrame, reference: str, *, note: str = SIMULATED) -> Figure:
+    """One method minus every other with its interval over people: a panel a metric, a row a method, a colour a dataset.
+
+    Args:
+        df: rows of `study.evaluation.difference_intervals` with columns ``metric`` (a name in ``METRICS``), ``dataset``
+            and ``against``, besides ``value``, ``low``, ``high`` (mm) and ``is_tie``.
+        reference: the method compared.
+        note: where the patients are from.
+
+    Raises:
+        StudyError: no difference.
+    """
+    require_columns(df, ("metric", "dataset", "against", "value", "low", "high", "is_tie"), "difference intervals")
+    metrics, datasets = (list(dict.fromkeys(df[name])) for name in ("metric", "dataset"))
+    methods = in_order(df["against"])
+    label = method_style(reference).label
+    figure = new_figure(1.6 + 0.34 * len(methods), f"{label} minus each other method; left of 0 it is better ({note})")
+    panels = np.atleast_1d(figure.subplots(1, len(metrics), sharey=True))
+    for ax, metric in zip(panels, metrics, strict=True):
+        stripe_rows(ax, len(methods))
+        for k, dataset in enumerate(datasets):
+            colour, marker = DATASET_STYLE[k % len(DATASET_STYLE)]
+            mine = df[(df["metric"] == metric) & (df["dataset"] == dataset)].set_index("against")
+            for method, row in mine.iterrows():
+                y = methods.index(str(method)) + 0.6 * ((k + 0.5) / len(datasets) - 0.5)
+                ax.plot([row["low"], row["high"]], [y, y], color=colour, lw=1.4)
+                ax.plot(row["value"], y, marker=marker, ms=5, mec=colour, mfc="white" if row["is_tie"] else colour)
+        ax.axvline(0, color=DARK, lw=1)
+        ax.grid(axis="x", alpha=0.3)
+        plain(ax, fill(judged_by(metric), 28))
+        ax.set_xlabel("mean and 95 % interval (mm)", fontsize=8)
+    name_rows(panels[0], [method_style(method).label for method in methods])
+    marks = [
+        Line2D([], [], marker=marker, color=colour, label=dataset)
+        for dataset, (colour, marker) in zip(datasets, DATASET_STYLE * len(datasets), strict=False)
+    ]
+    marks.append(Line2D([], [], ls="", marker="o", mfc="white", mec=DARK, label="hollow: a tie"))
+    below(figure, marks, 4)
+    return figure
 
 
 def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str = SIMULATED) -> Figure:
@@ -183,7 +231,7 @@ def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str
         df: columns ``dataset``, ``method`` (the other), ``difference`` (mm, ``reference`` minus the other, a row a
             case).
         reference: the method compared.
-        what: what the difference is of, for the title.
+        what: what the difference is of: a name in ``METRICS``, or words for the title.
         note: where the patient is from.
 
     Raises:
@@ -192,7 +240,7 @@ def paired_differences(df: pd.DataFrame, reference: str, what: str, *, note: str
     require_columns(df, ("dataset", "method", "difference"), "paired differences, a row a case")
     datasets, methods = list(dict.fromkeys(df["dataset"])), in_order(df["method"])
     label = method_style(reference).label
-    figure = new_figure(1.6 + 0.36 * len(methods), f"{what}: {label} minus each other method ({note})")
+    figure = new_figure(1.6 + 0.36 * len(methods), f"{judged_by(what)}: {label} minus each other method ({note})")
     panels = np.atleast_1d(figure.subplots(1, len(datasets), sharex=True, sharey=True))
     for ax, dataset in zip(panels, datasets, strict=True):
         mine = df[df["dataset"] == dataset]

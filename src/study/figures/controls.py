@@ -17,14 +17,13 @@ from numpy.typing import ArrayLike
 
 from study.evaluation.metrics import METRICS
 from study.figures.canvas import View, below, bounds, dots, look, new_figure, plain, project, require, require_columns
-from study.figures.rows import name_rows, spread, stripe_rows
-from study.figures.style import CT_COLOUR, DARK, GREY, SIMULATED, US_COLOUR, lighter
+from study.figures.rows import judged_by, name_rows, spread, stripe_rows
+from study.figures.style import CT_COLOUR, DARK, DATASET_STYLE, GREY, SIMULATED, US_COLOUR, lighter
 from study.types import Bools, Floats, RigidTransform
 
 __all__ = ["hausdorff_point", "rank_agreement", "truth_floor"]
 
 _MEASURED, _FLOOR = "#0077BB", "#c8c8c8"
-_DATASETS = (("#0077BB", "o"), ("#CC3311", "s"), ("#009988", "^"), ("#EE7733", "D"))  # Paul Tol's vibrant scheme
 _UNSEEN = to_hex(lighter(CT_COLOUR, 0.62))
 _SLAB_MM = 8.0  # half the thickness of the slice that the side view shows
 
@@ -49,7 +48,7 @@ def truth_floor(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     panels = figure.subplots(n_rows, 3, sharey=True, squeeze=False)
     for ax, metric in zip(panels.flat, metrics, strict=False):
         _draw_steps(ax, steps, df[df["metric"] == metric])
-        plain(ax, METRICS[metric].title)
+        plain(ax, fill(judged_by(metric), 36))
         ax.set_xlabel("mm", fontsize=8)
     for ax in panels.flat[len(metrics) :]:
         ax.set_visible(False)
@@ -167,7 +166,7 @@ def rank_agreement(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
         for k, dataset in enumerate(datasets):
             mine = df[(df["truth"] == truth) & (df["dataset"] == dataset)]
             aside = 0.66 * ((k + 0.5) / len(datasets) - 0.5)
-            _draw_agreement(ax, measures, mine, aside, *_DATASETS[k % len(_DATASETS)])
+            _draw_agreement(ax, measures, mine, aside, *DATASET_STYLE[k % len(DATASET_STYLE)])
         ax.axvline(0, color=DARK, lw=0.8)
         ax.set_xlim(low, 1.05)
         ax.grid(axis="x", alpha=0.3)
@@ -176,7 +175,7 @@ def rank_agreement(df: pd.DataFrame, *, note: str = SIMULATED) -> Figure:
     name_rows(panels[0], [_part_last(METRICS[measure].title) for measure in measures])
     marks: list[Any] = [
         Line2D([], [], ls="", marker=marker, color=colour, mec="black", label=f"{dataset}: mean; dot: a pair")
-        for dataset, (colour, marker) in zip(datasets, _DATASETS * len(datasets), strict=False)
+        for dataset, (colour, marker) in zip(datasets, DATASET_STYLE * len(datasets), strict=False)
     ]
     below(figure, marks, 4)
     return figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from study.evaluation.pair import in_order
 from study.figures.canvas import below, new_figure, plain, require, require_columns
 from study.figures.style import DARK, GREY, method_style
 
-__all__ = ["choices", "robustness"]
+__all__ = ["choice_pages", "choices", "robustness"]
 
 _SUMMARY = (
     "kind",
@@ -135,11 +136,31 @@ def _draw_kind(ax: Axes, rows: pd.DataFrame, methods: list[str], top: float) -> 
     ax.grid(axis="y", alpha=0.3)
 
 
-def choices(summary: pd.DataFrame) -> Figure:
+def choice_pages(summary: pd.DataFrame, most: int = 24) -> list[list[str]]:
+    """The choices of a sensitivity summary on as many pages as keep each figure on a screen.
+
+    Args:
+        summary: of `study.evaluation.sensitivity.sensitivity_summary`.
+        most: rows of a page; a heading counts as one.
+    """
+    options = summary[summary["role"] != "paper"].drop_duplicates(["choice", "option"])
+    pages: list[list[str]] = []
+    room = 0
+    for choice, n in options.groupby("choice", sort=False).size().items():
+        if n + 1 > room:
+            pages.append([])
+            room = most
+        pages[-1].append(str(choice))
+        room -= n + 1
+    return pages
+
+
+def choices(summary: pd.DataFrame, only: Sequence[str] | None = None) -> Figure:
     """A panel a choice and measure: what each option changes against the published one, mean and 95 % interval.
 
     Args:
         summary: of `study.evaluation.sensitivity.sensitivity_summary`.
+        only: the choices to draw, see `choice_pages`; all when None.
 
     Raises:
         StudyError: no option beside the published ones.
@@ -148,7 +169,8 @@ def choices(summary: pd.DataFrame) -> Figure:
     require_columns(summary, columns, "a sensitivity summary")
     listed = summary[summary["role"] != "paper"].drop_duplicates(["choice", "option"])
     require(listed, "options other than the published")
-    names = list(dict.fromkeys(listed["choice"]))
+    names = [name for name in dict.fromkeys(listed["choice"]) if only is None or name in only]
+    require(names, "choices")
     counts = [int((listed["choice"] == name).sum()) for name in names]
     people = int(summary["people"].max())
     figure = new_figure(
@@ -163,7 +185,7 @@ def choices(summary: pd.DataFrame) -> Figure:
         published = summary.loc[(summary["choice"] == name) & (summary["role"] == "paper"), "option"].iloc[0]
         grid[row, 0].set_title(f"{name}: {published} →", fontsize=8.5, loc="left", pad=2.5)
     for column, view in enumerate(_VIEWS):
-        _scale(grid[:, column], summary, view)
+        _scale(grid[:, column], summary, view, names)
     marks: list[Any] = [Line2D([], [], ls="", marker=m, color=c, label=label) for label, c, m in _ROLE.values()]
     marks.append(Patch(color=_LUCK_COLOUR, label="other seeds of the published graph, 95 % interval"))
     marks.append(Line2D([], [], ls="", marker=">", color=GREY, mec="black", label="beyond the axis"))
@@ -196,14 +218,14 @@ def _draw_choice(ax: Axes, summary: pd.DataFrame, choice: str, view: tuple[str, 
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _scale(axes: Any, summary: pd.DataFrame, view: tuple[str, str, float, str]) -> None:
+def _scale(axes: Any, summary: pd.DataFrame, view: tuple[str, str, float, str], names: Sequence[str]) -> None:
     """One axis for a column, that a single wide option does not stretch, and the heading with the published mean."""
     metric, heading, factor, unit = view
     rows = _of(summary, view)
     end = max(float(np.nanpercentile(np.abs(rows["change"]), 85)) * 1.3, 0.02 * factor)
     for ax in axes:
         ax.set_xlim(-end, end)
-    for choice, ax in zip(dict.fromkeys(rows["choice"]), axes, strict=True):
+    for choice, ax in zip(names, axes, strict=True):
         for y, change in enumerate(rows.loc[rows["choice"] == choice, "change"]):
             if abs(change) > end:
                 side = np.sign(change)

@@ -8,9 +8,17 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from study.evaluation.metrics import METRICS
 from study.evaluation.statistics import population_sd
 from study.figures.style import method_style
 from study.types import Floats
+
+
+def judged_by(metric: str) -> str:
+    """A metric's title and, where its name does not tell, by whose judgement it is."""
+    title = METRICS[metric].title if metric in METRICS else metric
+    by_truth = metric.startswith(("true_", "registered_"))
+    return title if by_truth or metric not in METRICS else f"{title}, by the paper's protocol"
 
 
 def stripe_rows(ax: Axes, n: int) -> None:

@@ -1,7 +1,7 @@
 """Colours, markers and labels: rib levels, clouds and methods look the same in every figure.
 
 Rib levels have one colour each, the patient's left lighter than the right. Methods have one colour and marker each: as
-tuned solid, as shipped lighter and hatched; a dark outline where they see the visible surface only.
+tuned solid, as shipped lighter; a dark outline where they see the visible surface only.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ Colour = tuple[float, float, float]
 
 LEVEL_COLOUR = {2: "#0072B2", 3: "#E69F00", 4: "#009E73", 5: "#CC79A7"}  # Okabe and Ito
 GREY, DARK, PALE = "#8c8c8c", "#333333", "#c8c8c8"
+DATASET_STYLE = (("#0077BB", "o"), ("#CC3311", "s"), ("#009988", "^"), ("#EE7733", "D"))  # Paul Tol's vibrant scheme
 CT_COLOUR, US_COLOUR = "#D55E00", "#0072B2"
 
 # Where numbers come from, for titles and legends.
@@ -63,7 +64,7 @@ class MethodStyle:
         label: for legends.
         colour: of lines and fills.
         marker: of points.
-        tuned: tuned methods are solid, the others lighter and hatched.
+        tuned: tuned methods are solid, the others lighter.
         visible: methods that register the visible surface only have a dark outline, the others one of their colour.
     """
 
@@ -75,18 +76,13 @@ class MethodStyle:
 
     @property
     def edge(self) -> str:
-        """Outline of bars, boxes and markers."""
+        """Outline of boxes and markers."""
         return "#000000" if self.visible else self.colour
 
     @property
     def face(self) -> Colour:
-        """Fill of bars, boxes and markers."""
+        """Fill of boxes and markers."""
         return lighter(self.colour, 0.0 if self.tuned else 0.62)
-
-    @property
-    def hatch(self) -> str:
-        """Hatch of bars and boxes."""
-        return "" if self.tuned else "////"
 
 
 _CELLS = {"_tuned_whole": (True, False), "_tuned": (True, True), "_visible": (False, True)}  # tuned, visible

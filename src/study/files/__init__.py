@@ -5,12 +5,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from study.files.calibration import read_calibration, write_calibration
-    from study.files.clouds import read_ply, read_timed_ply, read_waypoints, write_ply, write_registration
+    from study.files.clouds import read_ply, read_timed_ply, write_ply
     from study.files.landmarks import read_landmarks
     from study.files.plus import read_plus
     from study.files.plus_write import write_plus
+    from study.files.registered import write_registration
     from study.files.sweep_folder import read_folder, write_folder
     from study.files.volumes import read_labels, read_masks, read_volume, write_volume
+    from study.files.waypoints import read_waypoints
 
 __all__ = [
     "read_calibration",
@@ -41,12 +43,12 @@ _HOMES = {
     "read_ply": "clouds",
     "read_timed_ply": "clouds",
     "read_volume": "volumes",
-    "read_waypoints": "clouds",
+    "read_waypoints": "waypoints",
     "write_calibration": "calibration",
     "write_folder": "sweep_folder",
     "write_plus": "plus_write",
     "write_ply": "clouds",
-    "write_registration": "clouds",
+    "write_registration": "registered",
     "write_volume": "volumes",
 }
 

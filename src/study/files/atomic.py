@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
@@ -32,6 +33,33 @@ def replacing(path: Path, *, alone: bool = False) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def filling(folder: Path, names: Collection[str], last: str) -> Iterator[Path]:
+    """A temporary folder for the block to fill; if it ends well, its files replace those called ``names`` there.
+
+    A file of those names that the block did not write is removed; any other file in the folder stays. ``last`` goes
+    first and comes last: where it is, all the others are, and are of the same writing.
+
+    Args:
+        folder: where the files will be; made if it is not there.
+        names: of all files that the block may write.
+        last: one of them.
+    """
+    folder = folder.resolve()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".half-{os.getpid()}.{folder.name}")
+    try:
+        temporary.mkdir()
+        yield temporary
+        folder.mkdir(exist_ok=True)
+        for name in (last, *(name for name in names if name != last)):
+            (folder / name).unlink(missing_ok=True)
+        for path in sorted(temporary.iterdir(), key=lambda path: (path.name == last, path.name)):
+            path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

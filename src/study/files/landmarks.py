@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from study.ct.landmarks import Landmarks
 from study.errors import StudyError
+from study.files.waypoints import read_waypoint_file
 from study.files.yaml_text import line_of, located, read_yaml, repeated_keys
 from study.types import CARTILAGES, Floats, Part
 
+FIDUCIALS = (".mrk.json", ".fcsv")
+LABEL = r"(?P<what>junction|attachment) (?P<side>right|left) (?P<level>[2-5])|sternum (?P<number>\d{1,3})"
 Point = Annotated[list[Annotated[float, Field(ge=-3000.0, le=3000.0)]], Field(min_length=3, max_length=3)]  # RAS+ mm
 
 
@@ -44,18 +48,23 @@ class _File(BaseModel):
 
 
 def read_landmarks(path: str | os.PathLike[str]) -> Landmarks:
-    """Read ``annotations/<subject>.yaml``.
+    """Read ``annotations/<subject>.yaml``, or a point list of 3D Slicer (``.mrk.json``, ``.fcsv``).
+
+    The points of a list are labelled ``junction right 2``, ``attachment left 5``, ``sternum 1``, ``sternum 2`` ... from
+    the head down; ``_``, ``.`` and ``-`` serve as well as a space.
 
     Raises:
         StudyError: no file, not YAML, a key that is missing, unknown, repeated or of the wrong kind (the message has
-            its place), or points that are no RAS+ chest.
+            its place), a point list with other labels, or points that are no RAS+ chest.
     """
     path = Path(path)
+    if path.name.lower().endswith(FIDUCIALS):
+        return _from_points(path)
     try:
         raw, root = read_yaml(path)
     except FileNotFoundError as error:
         raise StudyError(
-            f"expected a landmark file at {path}, got nothing there; make one as the README shows"
+            f"expected a landmark file at {path}, got nothing there; make one as docs/use.md shows"
         ) from error
     if faults := repeated_keys(root):
         raise located(faults, root, path.name)
@@ -78,6 +87,31 @@ def read_landmarks(path: str | os.PathLike[str]) -> Landmarks:
         file.made_by,
         file.method,
         tuple(file.hard_to_see),
+    )
+
+
+def _from_points(path: Path) -> Landmarks:
+    """Landmarks of a labelled point list."""
+    file = read_waypoint_file(path)
+    ends: dict[str, dict[Part, Floats]] = {"junction": {}, "attachment": {}}
+    sternum: dict[int, Floats] = {}
+    for label, point in zip(file.waypoints.labels, file.waypoints.points, strict=True):
+        found = re.fullmatch(LABEL, " ".join(re.split(r"[\s_.-]+", label.strip().lower())))
+        if found is None:
+            raise StudyError(
+                f"{path.name}: expected labels as in 'junction right 2', 'attachment left 5' and 'sternum 1', got "
+                f"{label!r}; rename the point"
+            )
+        table: dict[Any, Floats] = sternum if found["number"] else ends[found["what"]]
+        key = int(found["number"]) if found["number"] else Part.cartilage(found["side"], int(found["level"]))
+        if key in table:
+            raise StudyError(f"{path.name}: expected each label once, got {label!r} twice; rename or delete one")
+        table[key] = point
+    if len(sternum) < 2:
+        raise StudyError(f"{path.name}: expected 'sternum 1', 'sternum 2' or more, got {len(sternum)}; place them")
+    line = np.array([sternum[number] for number in sorted(sternum)])
+    return Landmarks(
+        path.name.split(".")[0], ends["junction"], ends["attachment"], line, "not stated", f"points of {path.name}"
     )
 
 

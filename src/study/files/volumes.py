@@ -7,7 +7,7 @@ Pixels are unpacked here, because ITK stops before the checksum of a compressed 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,11 @@ from study.files.atomic import replacing
 from study.files.dicom import read_dicom
 from study.files.headers import ORTHOGONAL_ATOL, itk_geometry
 from study.files.nifti import read_nifti_header
+from study.files.spaces import LPS_TO_RAS
 from study.files.stored import read_pixels
 from study.files.text_images import read_metaimage_header, read_nrrd_header
 from study.types import Floats, RigidTransform, Volume
 
-LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0])
 HEADERS = {
     ".nii": read_nifti_header,
     ".nii.gz": read_nifti_header,
@@ -129,6 +129,27 @@ def read_masks(
     assert grid is not None
     assert values is not None
     return Volume(values, grid.spacing_mm, grid.T_ras_index, f"labels of {grid.name}"), ids
+
+
+def masks_in(folder: str | os.PathLike[str], structures: Iterable[str]) -> dict[str, Path]:
+    """The mask files of a folder as TotalSegmentator writes it, ``sternum.nii.gz`` and so on, by structure.
+
+    Raises:
+        StudyError: none of the structures has a file there.
+    """
+    folder = Path(folder)
+    found = {
+        name: folder / f"{name}{suffix}"
+        for name in structures
+        for suffix in reversed(HEADERS)
+        if (folder / f"{name}{suffix}").is_file()
+    }
+    if not found:
+        raise StudyError(
+            f"{folder}: expected masks such as sternum.nii.gz and rib_left_2.nii.gz, got none; "
+            "give the folder that TotalSegmentator wrote"
+        )
+    return found
 
 
 def write_volume(volume: Volume, path: str | os.PathLike[str]) -> Path:

@@ -5,6 +5,7 @@ from study.results.comparisons import Comparisons, compare_all
 from study.results.evidence import Evidence, find_evidence, pairs_table
 from study.results.metrics_csv import CASE, FAILED, read_metrics
 from study.results.run import REFERENCE, Run, against_reference, find_runs, keep_pictures, newest, run_folder
+from study.results.shown import typical_and_worst
 from study.results.tables import beside_paper, hd_table, paper_hd_table, paper_waypoints, waypoint_summary
 from study.results.verdicts import claim_rows, claims_markdown, write_claims
 
@@ -32,6 +33,7 @@ __all__ = [
     "paper_waypoints",
     "read_metrics",
     "run_folder",
+    "typical_and_worst",
     "waypoint_summary",
     "write_claims",
 ]

@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from study.errors import StudyError
+from study.results.clouds import CLOUDS
 
 PROVENANCE = "provenance.json"
 # What versions up to 0.3.0 wrote into a run's folder: their provenance does not list it.
@@ -160,7 +161,7 @@ def own_files(folder: Path) -> set[str] | None:
         return None
     files = record.get("files_sha256")
     if isinstance(files, dict):
-        return {PROVENANCE, *files}
+        return {PROVENANCE, CLOUDS, *files}
     return {path.name for path in folder.iterdir() if _OLDER.fullmatch(path.name)}
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from study.files.atomic import json_text
+from study.files.atomic import json_text, sha256_of, write_json, write_text
+from study.results.claim import PROVENANCE
 
 CRATE = "ro-crate-metadata.json"
 PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
@@ -37,7 +38,21 @@ _TOLD = {
     "environment.lock": "exact versions of all packages",
     "failures.log": "where in the code cases failed",
 }
-_TIMED = ("timings.csv", "provenance.json")  # of no size of their own: it changes from run to run
+_TIMED = ("timings.csv", PROVENANCE)  # of no size of their own: it changes from run to run
+
+
+def seal(folder: Path, names: Iterable[str], provenance: Mapping[str, Any]) -> None:
+    """Describe the files of a run, and hold them to what they are now by their hashes: the crate, then provenance.
+
+    Args:
+        folder: of the run.
+        names: of its files, without provenance.
+        provenance: of the run; the hashes are added.
+    """
+    files = sorted({*names} - {CRATE})
+    write_text(folder / CRATE, crate_text(folder, files, provenance))
+    hashes = {name: sha256_of(folder / name) for name in (*files, CRATE)}
+    write_json({**provenance, "files_sha256": hashes}, folder / PROVENANCE)
 
 
 def crate_text(folder: Path, names: Iterable[str], record: Mapping[str, Any]) -> str:
@@ -49,7 +64,7 @@ def crate_text(folder: Path, names: Iterable[str], record: Mapping[str, Any]) ->
         record: its provenance.
     """
     notebooks = (path.relative_to(folder).as_posix() for path in folder.rglob("*.ipynb"))
-    files = [_file(folder, name) for name in sorted({*names, *notebooks, "provenance.json"})]
+    files = [_file(folder, name) for name in sorted({*names, *notebooks, PROVENANCE})]
     given = [{"@id": name} for name in ("parameters.json", "manifest.yaml", "environment.lock") if name in {*names}]
     values = [
         {"@id": f"#{name}", "@type": "PropertyValue", "name": name, "value": record[name]}

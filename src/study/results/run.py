@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -20,8 +20,9 @@ from study.files.atomic import json_text, sha256_of, write_bytes, write_json, wr
 from study.files.places import CHECKOUT
 from study.naming import split_sweep
 from study.results.claim import PROVENANCE, Claim, claimed
+from study.results.clouds import CLOUDS, CaseName, Clouds, write_clouds
 from study.results.compare import Comparison, compare
-from study.results.crate import CRATE, crate_text
+from study.results.crate import seal
 from study.results.metrics_csv import (
     CASE,
     FAILED,
@@ -98,6 +99,11 @@ class Run:
             raise StudyError(f"expected {path}, got: {' '.join(str(error).split())}; run the data set again") from error
 
     @property
+    def own_manifest(self) -> bool:
+        """Whether its people are of a manifest of one's own: the paper's numbers are not put beside them."""
+        return bool(self.provenance.get("own_manifest", False))
+
+    @property
     def dataset(self) -> str:
         """Name of the data set.
 
@@ -153,7 +159,7 @@ class Run:
 
     def waypoint_summary(self) -> pd.DataFrame:
         """Waypoint errors of each method, see `study.results.tables.waypoint_summary`."""
-        return waypoint_summary(self.metrics)
+        return waypoint_summary(self.metrics, with_paper=not self.own_manifest)
 
     def summary(self) -> pd.DataFrame:
         """Every metric of every method as text, mean ± population SD over the pairs (n)."""
@@ -249,12 +255,28 @@ class Run:
         """Another run against this one as the reference, see `study.results.compare.compare`."""
         return compare(self.folder, candidate.folder)
 
+    def clouds(self) -> Clouds:
+        """Where every case put its points, see `study.results.clouds`.
+
+        Raises:
+            StudyError: the run kept none, or they are not as it left them.
+        """
+        path = self.folder / CLOUDS
+        if not path.is_file():
+            raise StudyError(f"expected the clouds of a run at {path}, got none; run the data set again")
+        if self.provenance.get("clouds_sha256") != sha256_of(path):
+            raise StudyError(f"{path}: expected the file that the run wrote, got another one; run the data set again")
+        return Clouds(path)
+
     def tables(self) -> list[Path]:
         """The Markdown tables beside the metrics."""
         return sorted(self.folder.glob("hd_table*.md"))
 
     def keep_figures(self, pictures: Mapping[str, bytes]) -> list[str]:
-        """Write PNG pictures of this run beside its metrics, and their hashes into its provenance; their file names.
+        """Write pictures of this run beside its metrics, and their hashes into its provenance; their file names.
+
+        Args:
+            pictures: by file name, as `study.figures.picture_files` gives them.
 
         Raises:
             StudyError: the folder holds another run by now, or one that was altered.
@@ -268,7 +290,7 @@ class Run:
                     f"{self.folder}: expected the run as it was made, but it {there.altered}; run it again"
                 )
             names = keep_pictures(self.folder, pictures)
-            _seal(self.folder, [*there.provenance["files_sha256"], *names], there.provenance)
+            seal(self.folder, [*there.provenance["files_sha256"], *names], there.provenance)
         return names
 
     def _repr_html_(self) -> str:
@@ -297,6 +319,7 @@ def write_run(
     provenance: Mapping[str, Any],
     failures: str = "",
     copies: Mapping[str, Path] | None = None,
+    clouds: Mapping[CaseName, str] | None = None,
 ) -> Run:
     """Write everything that tells of a run that has just ended, and describes it, all at once.
 
@@ -307,6 +330,8 @@ def write_run(
         provenance: see `study.results.provenance.provenance`; the hashes of the run's files are added.
         failures: tracebacks of cases that failed in a way nobody foresaw.
         copies: files that it was made with and that belong beside it, by the name they get.
+        clouds: of each case, as `study.results.clouds.pack` gives them; none are kept where there are none. Their hash
+            stands by itself in the provenance: a run whose clouds were left out of a copy is not an altered one.
 
     Raises:
         StudyError: rows that are not of the schema, or a file of somebody else's in the way; nothing is changed then.
@@ -316,21 +341,17 @@ def write_run(
     write_timings(timings, new / "timings.csv")
     if failures:
         write_text(new / FAILURES_LOG, failures)
-    write_tables(read_metrics(new / "metrics.csv"), new)
+    write_tables(read_metrics(new / "metrics.csv"), new, with_paper=not provenance.get("own_manifest", False))
     write_json(provenance["parameters"], new / "parameters.json")
     for name, path in (copies or {}).items():
         write_bytes(new / name, path.read_bytes())
-    _seal(new, [path.name for path in new.iterdir()], provenance)
+    names = [path.name for path in new.iterdir()]
+    if clouds:
+        write_clouds(clouds, new / CLOUDS)
+        provenance = {**provenance, "clouds_sha256": sha256_of(new / CLOUDS)}
+    seal(new, names, provenance)
     claim.swap_in()
     return Run(claim.folder)
-
-
-def _seal(folder: Path, names: Iterable[str], provenance: Mapping[str, Any]) -> None:
-    """Describe the files of a run, and hold them to what they are now by their hashes."""
-    files = sorted({*names} - {CRATE})
-    write_text(folder / CRATE, crate_text(folder, files, provenance))
-    hashes = {name: sha256_of(folder / name) for name in (*files, CRATE)}
-    write_json({**provenance, "files_sha256": hashes}, folder / PROVENANCE)
 
 
 def find_runs(folder: Path) -> list[Run]:
@@ -360,10 +381,10 @@ def newest(dataset: str, profile: str, seed: int) -> Run | None:
 
 
 def keep_pictures(folder: Path, pictures: Mapping[str, bytes]) -> list[str]:
-    """Write PNG pictures into a folder; their file names."""
+    """Write pictures, by file name, into a folder; their file names."""
     for name, content in pictures.items():
-        write_bytes(folder / f"{name}.png", content)
-    return [f"{name}.png" for name in pictures]
+        write_bytes(folder / name, content)
+    return list(pictures)
 
 
 def against_reference(run: Run, *, comparable: bool) -> str:

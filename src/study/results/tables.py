@@ -19,11 +19,12 @@ from study.results.metrics_csv import CASE, KEY, NOT_CONVERGED
 MOST_TABLES = 6  # of one patient each
 
 
-def write_tables(metrics: pd.DataFrame, out: Path) -> None:
+def write_tables(metrics: pd.DataFrame, out: Path, *, with_paper: bool = True) -> None:
     """Write into a new folder the Hausdorff tables in the shape of the paper's Table I: one a patient, columns the CTs.
 
     One CT with several patients (the planted deformations) is turned: columns are the patients. Sweeps of a patient are
     averaged. More patients than tables of that shape can show share one, in which a CT is averaged over its patients.
+    The paper's rows stand under the study's, but not where ``with_paper`` is false, as for people of one's own.
     """
     metrics = metrics.assign(target=[split_sweep(target)[0] for target in metrics["target"]])
     targets = sorted(metrics["target"].unique())
@@ -31,20 +32,21 @@ def write_tables(metrics: pd.DataFrame, out: Path) -> None:
     if metrics["source"].nunique() == 1:
         turned = metrics.assign(source=metrics["target"])
         caption = f"Hausdorff distance, {dataset}: {metrics['source'].iloc[0]} to each simulated patient"
-        write_hd_table(turned, out / "hd_table", caption=caption)
+        write_hd_table(turned, out / "hd_table", caption=caption, with_paper=with_paper)
         return
     if len(targets) > MOST_TABLES:
         caption = f"Hausdorff distance, {dataset}: each CT, mean over its simulated patients"
-        write_hd_table(metrics, out / "hd_table", caption=caption)
+        write_hd_table(metrics, out / "hd_table", caption=caption, with_paper=with_paper)
         return
     for target in targets:
         stem = out / ("hd_table" if len(targets) == 1 else f"hd_table_{target}")
         who = "the simulated patient" if target == "patient" else f"the simulated patient {target}"
         caption = f"Hausdorff distance, {dataset}: each CT to {who}"
-        write_hd_table(metrics[metrics["target"] == target], stem, caption=caption)
+        write_hd_table(metrics[metrics["target"] == target], stem, caption=caption, with_paper=with_paper)
     if len(targets) > 1:
         pairs_named = metrics.assign(source=metrics["source"] + " to " + metrics["target"])
-        write_hd_table(pairs_named, out / "hd_all_pairs", caption=f"Hausdorff distance, {dataset}: all ordered pairs")
+        caption = f"Hausdorff distance, {dataset}: all ordered pairs"
+        write_hd_table(pairs_named, out / "hd_all_pairs", caption=caption, with_paper=with_paper)
 
 
 PAPER_DATA = "paper (other data)"
@@ -170,13 +172,15 @@ def _mean_sd(mean: float, sd: float, empty: str) -> str:
     return empty if pd.isna(mean) else f"{mean:.2f}±{sd:.2f}"
 
 
-def write_hd_table(metrics: pd.DataFrame, stem: Path, metric: str = "hd", caption: str | None = None) -> pd.DataFrame:
+def write_hd_table(
+    metrics: pd.DataFrame, stem: Path, metric: str = "hd", caption: str | None = None, *, with_paper: bool = True
+) -> pd.DataFrame:
     """Write ``stem.csv`` (full precision), ``stem.md`` and ``stem.tex`` with the paper's rows; return the text table.
 
     The paper's rows are only there for the metric that the paper reports in Table I, the Hausdorff distance.
     """
     table = hd_table(metrics, metric)
-    paper = paper_hd_table() if metric == "hd" else paper_hd_table().iloc[:0]
+    paper = paper_hd_table() if metric == "hd" and with_paper else paper_hd_table().iloc[:0]
     display, note = beside_paper(table, paper)
     if paper.empty:
         display = display[[name for name in display if name != "Data" and not (display[name] == "").all()]]
@@ -208,13 +212,13 @@ def write_latex(display: pd.DataFrame, path: Path, caption: str, note: str) -> N
     )
 
 
-def waypoint_summary(metrics: pd.DataFrame) -> pd.DataFrame:
+def waypoint_summary(metrics: pd.DataFrame, *, with_paper: bool = True) -> pd.DataFrame:
     """Waypoint errors of each method over all CTs and waypoints (sec. IV-B), full precision.
 
     Returns:
         a row per metric and method: ``metric``, ``method``, ``mean``, ``sd`` (population), ``median``, ``max``,
         ``n_waypoints``, ``n_cases``, ``n_failed``, and where the paper reports it ``paper_mean``, ``paper_sd``
-        (other data).
+        (other data); without these two where ``with_paper`` is false.
 
     Raises:
         StudyError: several datasets, or no waypoint error in the rows.
@@ -247,4 +251,5 @@ def waypoint_summary(metrics: pd.DataFrame) -> pd.DataFrame:
                     "paper_sd": paper["sd"].get(method) if reported else np.nan,
                 }
             )
-    return pd.DataFrame(rows)
+    table = pd.DataFrame(rows)
+    return table if with_paper else table.drop(columns=["paper_mean", "paper_sd"])

@@ -1,5 +1,6 @@
 """Tracked ultrasound (sec. II): calibrations, masks to cloud; the virtual sweep and the sizes of its errors."""
 
+from study.ultrasound.b_mode_of_ct import b_mode_like, ct_frame, frame_below, frame_of, skin_depth_mm
 from study.ultrasound.bmode import BONE, CARTILAGE, Echo, simulate_bmode
 from study.ultrasound.bone_surface import BoneFinder, BoneSurface, find_bone_surface, mask_sweep
 from study.ultrasound.cloud import (
@@ -36,19 +37,24 @@ __all__ = [
     "SweepErrors",
     "SweepReport",
     "TrackedSweep",
+    "b_mode_like",
     "budget_cases",
     "calibrate_latency",
     "calibrate_spatial",
     "constant_shift_mm",
     "contour_points",
+    "ct_frame",
     "error_table",
     "find_bone_surface",
+    "frame_below",
     "frame_fates",
+    "frame_of",
     "mask_sweep",
     "simulate_bmode",
     "simulate_calibration_views",
     "simulate_latency_run",
     "simulate_sweep",
+    "skin_depth_mm",
     "sweep_cloud",
     "thin_evenly",
     "true_parts",
