@@ -102,7 +102,7 @@ def main() -> None:
     people = [(name, FIRST_SEED + k) for k in range(options.people) for name in phantom.SUBJECTS]
     table = pd.DataFrame([row for name, seed in people[: options.people] for row in rows_of(name, seed)])
     means = table.drop(columns="person").groupby(["sweep", "masks"], sort=False).mean()
-    print(f"\nmeans over {options.people} people, simulated\n{means.round(2).to_markdown()}")
+    print(f"\nmeans over {options.people} people, simulated\n{means.round(2).reset_index().to_markdown(index=False)}")
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def test_masks_of_slicer_give_the_cloud_of_the_inner_road(tmp_path, recording, s
         "base frame Tracker: no ReferenceToTrackerTransform is in the file",
         "calibration of rec_config.xml, beside the recording",
         "frames used: 50 of 60",
-        "frames no valid pose before or after, or too long a gap: 10 of 60",
+        "frames no valid pose before or after, or too long a gap: 10 of 60 (numbers 50-59)",
         "--front 0.000,0.000,-1.000",
     ):
         assert line in said.out, line

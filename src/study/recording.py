@@ -29,6 +29,7 @@ FOUND = (
 )
 FEW_USED = 0.5  # of the frames: fewer deserve a word
 SHOTS = 6  # frames in the picture
+MAX_RANGES = 12  # of frame numbers in a line; the report has all
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,9 @@ def cloud_of_recording(
     counts = Counter(masked.fates)
     front = ",".join(f"{value:.3f}" for value in np.round(made.front, 3) + 0.0)  # no minus before a zero
     lines = [*masked.notes, f"latency {1000 * masked.sweep.latency_s:.0f} ms taken out of the frames' stamps"]
-    lines += [f"frames {fate}: {n} of {len(masked.fates)}" for fate, n in counts.most_common()]
+    for fate, n in counts.most_common():
+        numbers = _ranges([i for i, one in enumerate(masked.fates) if one == fate])
+        lines.append(f"frames {fate}: {n} of {len(masked.fates)}" + ("" if fate == USED else f" (numbers {numbers})"))
     if counts[USED] < FEW_USED * len(masked.fates):
         lines.append(f"study: warning: only {counts[USED]} of {len(masked.fates)} frames were used; see {report.name}")
     return [
@@ -114,6 +117,18 @@ def _with_masks(sweep: TrackedSweep, show_progress: bool) -> _Masked:
     poor = f"poor image, quality below {BoneFinder.min_quality:g}"
     fates = [poor if fate == EMPTY and bad else fate for fate, bad in zip(frame_fates(masked), found.poor, strict=True)]
     return _Masked(masked, found.quality, tuple(fates), (*sweep.notes, FOUND))
+
+
+def _ranges(numbers: list[int]) -> str:
+    """Rising numbers as ``3, 7-9``, the first dozen ranges of them."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    shown = [f"{first}" if first == last else f"{first}-{last}" for first, last in runs[:MAX_RANGES]]
+    return ", ".join([*shown, *(["..."] if len(runs) > MAX_RANGES else [])])
 
 
 def _content(recording: Path, masked: _Masked, made: SweepCloud) -> dict[str, Any]:

@@ -28,7 +28,7 @@ Progress = Callable[[Iterable[int]], Iterable[int]]
 
 @dataclass(frozen=True)
 class BoneFinder:
-    """How the surface is looked for; the defaults were chosen on simulated frames of development people.
+    """How the surface is looked for; the defaults were chosen on simulated frames and by eye on one real recording.
 
     Attributes:
         wavelengths_mm: of the log-Gabor filters, along the beam.
