@@ -219,10 +219,15 @@ def report(folder: Path, html: bool, dataset: str | None, jobs: int) -> None:
     from study.results.run import find_runs, visible
 
     if html:
+        from study.datasets import reported
         from study.report import write_report
+        from study.results.finding import one_line
+        from study.results.run import Run
 
-        chosen = None if dataset is None else [name.strip() for name in dataset.split(",")]
-        click.echo(f"report: {write_report(folder, chosen, n_jobs=jobs, show_progress=True)}")
+        chosen = reported() if dataset is None else [name.strip() for name in dataset.split(",")]
+        page = write_report(folder, chosen, n_jobs=jobs, show_progress=True)
+        click.echo(f"finding: {one_line({name: Run(folder / name) for name in chosen})}")
+        click.echo(f"report: {page}")
         return
     for run in find_runs(folder):
         click.echo(f"\n## {run.folder.relative_to(folder)}")

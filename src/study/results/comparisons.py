@@ -54,11 +54,16 @@ class Comparisons:
         """What was compared and what differs, for a terminal."""
         if len(self.parts) == 1 and self.compared():
             return next(iter(self.compared().values())).report()
-        told = [
+        if self.verdict == AGREES:
+            rows = sum(part.n_compared for part in self.compared().values())
+            used = max(part.largest for part in self.compared().values())
+            told = f"compared {rows} rows of {', '.join(self.parts)}; largest difference {used:.3g} of its tolerance"
+            return f"{told}; all {len(self.parts)} data sets: {AGREES}"
+        each = [
             f"{name}: " + (part.report() if isinstance(part, Comparison) else f"{REFUSED}: {part}")
             for name, part in self.parts.items()
         ]
-        return "\n\n".join([*told, f"all {len(self.parts)} data sets: {self.verdict}"])
+        return "\n\n".join([*each, f"all {len(self.parts)} data sets: {self.verdict}"])
 
     def markdown(self) -> str:
         """What changed and by how much, old and new side by side, the largest first; for a job's summary."""

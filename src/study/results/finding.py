@@ -244,6 +244,21 @@ def in_short(runs: Mapping[str, Run], name: str) -> str:
     )
 
 
+def one_line(runs: Mapping[str, Run]) -> str:
+    """What came out, or why no finding can be stated, for a terminal."""
+    try:
+        reading(runs)
+    except NotBorneOut as error:
+        return f"none is stated: {error}"
+    name, run = next((name, run) for name, run in runs.items() if run.has_truth)
+    hd, true = ({method: float(_of(run, metric)[method].mean()) for method in run.methods} for metric in (HD, TRUE))
+    return (
+        f"by the paper's own measures the skeleton graph comes first of its four methods on {len(runs)} data sets "
+        f"(Hausdorff distance on {name} {hd[GRAPH]:.1f} mm, CPD {hd['cpd']:.1f}); by the truth it is "
+        f"{true[GRAPH]:.1f} mm off, CPD tuned {true['cpd_tuned']:.1f}, {BEST_METHOD} {true[BEST_METHOD]:.1f}"
+    )
+
+
 def between_real_people(run: Run) -> str:
     """What the protocol says of the graph and tuned CPD where no truth is known, and what is left of it in plane."""
     whole, plane = (_lead(run, metric, "cpd_tuned", GRAPH) for metric in (PROTOCOL, "waypoint_error_inplane"))
