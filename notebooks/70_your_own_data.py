@@ -4,9 +4,9 @@
 # From two files to a checked result: load a CT cloud and an ultrasound cloud, register them, look at what the result
 # says of itself, carry waypoints, save. The files are a small pair in `samples/`; put the names of your own there.
 #
-# **What is real and what is not.** The sample's CT cloud comes from a real CT (LIDC-IDRI-0001, CC BY 3.0). Its
-# ultrasound cloud is simulated: a virtual sweep over the same person under a known deformation. That is why the last
-# part can say how far off the waypoints truly are; for your own patient nobody can.
+# **What is real and what is not.** Nothing of the sample is: two synthetic people of the study's phantom, one with a
+# CT, the other under a simulated sweep. The deformation between them is known. That is why the last part can say how
+# far off the waypoints truly are; for your own patient nobody can.
 
 # %% tags=["parameters"]
 dataset = "phantom"  # has no effect: the files below are read
@@ -26,7 +26,7 @@ from study.types import PointCloud
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 folder = CHECKOUT / "samples"
 CT, US, WAYPOINTS = folder / "ct.ply", folder / "us.ply", folder / "waypoints.csv"
-FRONT = (-0.4642, -0.8610, -0.2077)  # from the chest to the probe, in the frame of US; None where it is not known
+FRONT = None  # (x, y, z) from the chest to the probe, in the frame of US; None where it is not known
 OUT = CHECKOUT / "results" / "trials" / "your_own_data"
 
 # %% [markdown]

@@ -16,7 +16,7 @@ def test_the_samples_are_small_and_say_their_licence() -> None:
     assert {"README.md", "ct.ply", "us.ply", "waypoints.csv", "waypoints_true.csv"} == set(sizes)
     assert max(sizes.values()) < 300_000
     page = (SAMPLES / "README.md").read_text(encoding="utf-8")
-    assert all(word in page for word in ("CC BY 3.0", "LIDC-IDRI-0001", "simulated", *(set(sizes) - {"README.md"})))
+    assert all(word in page for word in ("Licence: MIT", "synthetic", "simulated", *(set(sizes) - {"README.md"})))
 
 
 def test_the_sample_pair_is_a_chest_in_two_frames_with_paired_waypoints() -> None:

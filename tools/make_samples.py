@@ -14,7 +14,6 @@ from study.params import find_profile
 from study.types import Floats
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
-PATIENT = "planted1"  # the smallest of five known deformations
 
 
 def write_places(points: Floats, labels: tuple[str, ...], path: Path) -> None:
@@ -24,19 +23,18 @@ def write_places(points: Floats, labels: tuple[str, ...], path: Path) -> None:
 
 
 def main() -> None:
-    """Make the files from the study's own data set `planted`."""
-    settings = replace(find_profile("full"), ct_points=6000)
-    data = find_dataset("planted", settings, 0)
-    source = data.sources()[0]
-    anatomy, patient = data.anatomy(source), data.patient(PATIENT)
+    """Make the files from the study's own data set `phantom`."""
+    settings = replace(find_profile("quick"), ct_points=6000, us_spacing_mm=1.5)
+    data = find_dataset("phantom", settings, 0)
+    source, target = data.pairs()[0]
+    anatomy, patient = data.anatomy(source), data.patient(target)
     pair = data.pair(anatomy, patient)
     assert pair.true_waypoints is not None
     write_ply(replace(anatomy.cloud, parts=None), SAMPLES / "ct.ply")
     write_ply(replace(patient.cloud, parts=None), SAMPLES / "us.ply")
     write_places(anatomy.waypoints.points, anatomy.waypoints.labels, SAMPLES / "waypoints.csv")
     write_places(pair.true_waypoints, anatomy.waypoints.labels, SAMPLES / "waypoints_true.csv")
-    front = ",".join(f"{x:.4f}" for x in patient.cloud.front)
-    print(f"{source} to {PATIENT}; --front {front}")
+    print(f"{source} to {target}: {len(anatomy.cloud)} and {len(patient.cloud)} points")
 
 
 if __name__ == "__main__":

@@ -131,7 +131,8 @@ def _even_chest(cloud: PointCloud) -> Chest:
     seen, seen_s = _evened(local, cloud.times, MIN_SPACING_MM)
     if len(seen) in (len(kept), len(cloud)):
         return chest
-    _, like = nearest(seen, kept)
+    # In the order of the cloud that the chest was found in, which is not that of ``kept`` where nothing was thinned.
+    _, like = nearest(seen, local if fine is cloud else kept)
     assert chest.cloud.parts is not None
     parts = chest.cloud.parts[like]
     return replace(chest, cloud=replace(chest.cloud, points=seen @ axes + centre, parts=parts, times=seen_s))
