@@ -20,8 +20,8 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from study import ct, datasets, figures, geometry, params, seeds, ultrasound
-from study.types import CARTILAGES, Part
+from study import ct, datasets, figures, geometry, params, seeds, types, ultrasound
+from study.types import Part
 
 params.check_parameters(globals(), dataset=str, profile=str, seed=int)
 data = datasets.find_dataset(dataset, params.find_profile(profile), seed)
@@ -106,7 +106,7 @@ def rib_depth_mm(places):
 
 
 # %%
-places = min(map(on_both, CARTILAGES), key=rib_depth_mm)  # where the rib lies least deep
+places = min(map(on_both, types.CARTILAGES), key=rib_depth_mm)  # where the rib lies least deep
 places["cartilage"] = on_both(Part.RIGHT_4)["cartilage"]  # one that is not calcified
 probe, rng = ultrasound.Probe(), seeds.named_rng(seed, "b-mode")
 frames = {what: ultrasound.frame_below(first.image, first.mask, place, probe, rng) for what, place in places.items()}
