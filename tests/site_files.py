@@ -18,10 +18,10 @@ from study.datasets import people
 from study.params import StudyParams
 from study.seeds import named_rng
 from study.types import Bools, Floats, Waypoints
-from study.ultrasound import Probe, TrackedSweep, sweep_cloud
+from study.ultrasound import Probe, SweepErrors, TrackedSweep, sweep_cloud
 
 SEED = 0
-PROBE = Probe(pixel_mm=0.4, frames_per_s=10.0)
+PROBE = Probe(pixel_mm=0.4, frames_per_s=30.0)
 LPS = [-1.0, -1.0, 1.0]
 
 
@@ -35,8 +35,8 @@ class Scene:
 
 
 @cache
-def scene(ct_points: int, us_spacing_mm: float) -> Scene:
-    """The inner road up to the two clouds, with a coarser probe than the study's; every error at its size."""
+def scene(ct_points: int, us_spacing_mm: float, errors: SweepErrors | None = None) -> Scene:
+    """The inner road up to the two clouds, with coarser pixels than the study's; every error at its size when None."""
     ids = structure_ids()
     persons = []
     for name in ("ct1", "patient"):
@@ -54,7 +54,7 @@ def scene(ct_points: int, us_spacing_mm: float) -> Scene:
         patch.object(people, "simulate_sweep", partial(people.simulate_sweep, probe=PROBE)),
         patch.object(people, "sweep_cloud", keep),
     ):
-        patient = people.make_patient(persons[1], params, SEED)
+        patient = people.make_patient(persons[1], params, SEED, errors)
     return Scene(persons[0], kept[0], patient)
 
 
