@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ import yaml
 
 from study import phantom
 from study.data.manifest import load_manifest
+from study.files.landmarks import read_landmarks
 from study.files.volumes import write_volume
 from study.params import PHANTOM_SEED, StudyParams
 from study.seeds import named_rng
@@ -80,6 +82,32 @@ def landmark_file(parts: Volume, path: Path) -> Path:
     }
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
+
+
+def points_file(path: Path, source: Path, space: str = "LPS", rename: dict[str, str] | None = None) -> Path:
+    """The landmarks of a YAML file as 3D Slicer saves points."""
+    landmarks = read_landmarks(source)
+    named = {f"junction {p.side} {p.level}": landmarks.junctions[p] for p in CARTILAGES}
+    named |= {f"Attachment_{p.side}-{p.level}": landmarks.attachments[p] for p in CARTILAGES}
+    named |= {f"sternum {k}": point for k, point in enumerate(landmarks.sternum, start=1)}
+    sign = np.array([-1.0, -1.0, 1.0]) if space == "LPS" else np.ones(3)
+    control = [
+        {"label": (rename or {}).get(label, label), "position": (sign * point).tolist()}
+        for label, point in reversed(named.items())  # in any order
+    ]
+    markup = {"type": "Fiducial", "coordinateSystem": space, "coordinateUnits": "mm", "controlPoints": control}
+    path.write_text(json.dumps({"markups": [markup]}), encoding="utf-8")
+    return path
+
+
+def masks_folder(folder: Path, without: tuple[str, ...] = ()) -> Path:
+    """The labels of a phantom as TotalSegmentator writes them: a binary file for each structure, others beside."""
+    labels = scan("ct1")[1]
+    for name, value in structure_ids().items():
+        if name not in without:
+            nifti(labels.with_values((labels.values == value).astype(np.uint8)), folder / f"{name}.nii.gz")
+    nifti(labels.with_values(np.zeros(labels.shape, np.uint8)), folder / "liver.nii.gz")
+    return folder
 
 
 def own_manifest(folder: Path, names: tuple[str, ...] = ("ct1", "ct2"), cohort: str = "mine") -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pandas as pd
 import pytest
 import yaml
 from drawn_chest import draw, drawn_landmarks
-from phantom_files import SMALL, landmark_file, nifti, own_manifest, scan, structure_ids
+from phantom_files import SMALL, landmark_file, masks_folder, nifti, own_manifest, points_file, scan, structure_ids
 from PIL import Image
 
 from study import params as study_params
@@ -41,16 +40,6 @@ def refused(capsys: Capture, *arguments: str | Path) -> str:
     return err
 
 
-def masks_folder(folder: Path, without: tuple[str, ...] = ()) -> Path:
-    """The labels of a phantom as TotalSegmentator writes them: a binary file for each structure, others beside."""
-    labels = scan("ct1")[1]
-    for name, value in structure_ids().items():
-        if name not in without:
-            nifti(labels.with_values((labels.values == value).astype(np.uint8)), folder / f"{name}.nii.gz")
-    nifti(labels.with_values(np.zeros(labels.shape, np.uint8)), folder / "liver.nii.gz")
-    return folder
-
-
 # --- study cloud ---------------------------------------------------------------------------------------------------
 
 
@@ -70,22 +59,6 @@ def test_a_folder_of_masks_gives_the_cloud_of_the_label_volume(tmp_path: Path, c
 
 
 # --- landmarks -----------------------------------------------------------------------------------------------------
-
-
-def points_file(path: Path, source: Path, space: str = "LPS", rename: dict[str, str] | None = None) -> Path:
-    """The landmarks of a YAML file as 3D Slicer saves points."""
-    landmarks = read_landmarks(source)
-    named = {f"junction {p.side} {p.level}": landmarks.junctions[p] for p in CARTILAGES}
-    named |= {f"Attachment_{p.side}-{p.level}": landmarks.attachments[p] for p in CARTILAGES}
-    named |= {f"sternum {k}": point for k, point in enumerate(landmarks.sternum, start=1)}
-    sign = np.array([-1.0, -1.0, 1.0]) if space == "LPS" else np.ones(3)
-    control = [
-        {"label": (rename or {}).get(label, label), "position": (sign * point).tolist()}
-        for label, point in reversed(named.items())  # in any order
-    ]
-    markup = {"type": "Fiducial", "coordinateSystem": space, "coordinateUnits": "mm", "controlPoints": control}
-    path.write_text(json.dumps({"markups": [markup]}), encoding="utf-8")
-    return path
 
 
 @pytest.fixture
