@@ -78,7 +78,8 @@ def registration_grid(
         panels = grid[k // columns, 2 * (k % columns) :]
         for ax, view, extent, words in zip(panels, views, extents, (text, ""), strict=False):
             dots(ax, project(us[thin(len(us), 1600)], view, T_us_chest), PALE, size=1.5)
-            drawn = _by_distance(ax, points, residual[name], view, T_us_chest, top)
+            size = 2.5 if len(clouds) > 2 else 9.0  # larger in large panels
+            drawn = _by_distance(ax, points, residual[name], view, T_us_chest, top, size)
             look(ax, view, extent, words)
             ax.set_xlabel("left (mm)" if view == "front" else "front (mm)", fontsize=8)
     for ax in grid.ravel():
@@ -90,12 +91,18 @@ def registration_grid(
 
 
 def _by_distance(
-    ax: Axes, points: Floats, distance: Floats, view: View, T_us_chest: RigidTransform | None, top: float
+    ax: Axes,
+    points: Floats,
+    distance: Floats,
+    view: View,
+    T_us_chest: RigidTransform | None,
+    top: float,
+    size: float = 2.5,
 ) -> Any:
     """A warped cloud, coloured by its distance to the US cloud."""
     some = thin(len(points), 1600)  # more cannot be told apart in a small panel, and weigh
     seen = project(points[some], view, T_us_chest)
-    return dots(ax, seen, distance[some], size=2.5, cmap=steps("viridis"), vmin=0, vmax=top)
+    return dots(ax, seen, distance[some], size=size, cmap=steps("viridis"), vmin=0, vmax=top)
 
 
 def _distance_bar(figure: Figure, drawn: Any, grid: Any) -> None:
