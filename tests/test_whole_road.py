@@ -24,7 +24,7 @@ from study.ultrasound import cloud as cloud_module
 from study.ultrasound import upper_contour
 
 METHODS = ("gaussian_process", "skeleton_graph")
-POINTS, SPACING_MM = 2000, 2.0
+POINTS, SPACING_MM = 2000, 1.5
 FILES_MM = 0.1  # what files and command line may add
 
 

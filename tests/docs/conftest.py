@@ -20,5 +20,5 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m study "$@"\n', encoding="utf-8")
     program.chmod(0o755)
-    write_site(folder, scene(2000, 2.0, SweepErrors.none()))
+    write_site(folder, scene(2000, 1.5, SweepErrors.none()))
     return folder
