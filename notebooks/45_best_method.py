@@ -95,7 +95,7 @@ table.loc[best_first].rename_axis("mean over pairs, mm")
 # `pair.bounds(waypoints)` says how far a waypoint may be off, 19 times in 20. It is one number: nothing that a
 # registration knows of itself told a good waypoint from a bad one on development people, so the bound does not pretend
 # to. A patient's waypoints share the shift of one sweep, so that of a single patient it may cover fewer: of 27 more
-# development patients (`results/tuning/bounds_by_kind.csv`) it covers 97 %, of two of them less than 90 %. Share of
+# development patients (`results/tuning/bounds_by_kind.csv`) it covers 98 %. Share of
 # waypoints within it, over all pairs:
 
 # %%

@@ -14,12 +14,16 @@ TIMES = np.arange(0, 10, 0.05)
 EXAMPLES: dict[str, Callable[[], Figure]] = {
     "sweep_in_space": lambda: figures.sweep_in_space(POINTS + 30.0 * FRONT, CLOUD, TETRAHEDRON),
     "frame_with_mask": lambda: figures.frame_with_mask(np.eye(20, 30, dtype=bool), (0.2, 0.1), np.ones((20, 30))),
+    "sweep_overview": lambda: figures.sweep_overview(
+        CLOUD, -FRONT, [("frame 1", np.eye(20, 30), np.eye(20, 30, dtype=bool))] * 2, (0.2, 0.1), title="a sweep"
+    ),
     "latency_fit": lambda: figures.latency_fit(100 + 5 * np.sin(TIMES - 0.268), TIMES, np.sin(TIMES), TIMES, 0.268),
 }
 REFUSED: dict[str, Callable[[], Figure]] = {
     "untracked": lambda: figures.sweep_in_space(np.full((5, 3), np.nan), CLOUD),
     "no frame": lambda: figures.frame_with_mask(np.zeros((0, 4)), (0.2, 0.2)),
     "frame of another size": lambda: figures.frame_with_mask(np.ones((4, 4)), (0.2, 0.2), np.ones((4, 5))),
+    "no shots": lambda: figures.sweep_overview(CLOUD, -FRONT, [], (0.2, 0.1), title="a sweep"),
     "no depths": lambda: figures.latency_fit([np.nan] * 3, [0, 1, 2], [0, 1], [0, 1], 0.1),
 }
 

@@ -130,7 +130,7 @@ def test_the_bounds_cover_more_people_of_every_kind():
     }
     everyone = table[table["kind"] == "all"]
     assert (everyone["patients"] >= 24).all()
-    assert everyone["covers"].between(0.90, 0.98).all()
+    assert everyone["covers"].between(0.95, 0.99).all()  # the bound is that of people who differ more
     assert (table["covers"] >= 0.90).all()
 
 
