@@ -69,7 +69,10 @@ def test_the_hook_does_nothing_where_it_is_not_asked_for(monkeypatch: pytest.Mon
             tcp.connect(("192.0.2.1", 9))
 
 
-def test_workers_and_other_processes_are_held_to_it() -> None:
+def test_workers_and_other_processes_are_held_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "0")
+    Workers(2, False).run("before", {n: (abs, n) for n in range(4)})  # which stay
+    monkeypatch.setenv(VARIABLE, "1")
     found = Workers(2, False).run("ways out", {n: (socket.gethostbyname, "example.org") for n in range(2)})
     assert all("got one to example.org" in str(outcome.error) for outcome in found.values())
     done = subprocess.run(

@@ -1,6 +1,7 @@
 """Nothing beyond this machine: with ``STUDY_OFFLINE`` set, every connection that Python code tries is refused by name.
 
-Processes that this one starts inherit the variable, so workers and notebooks are held to it, too.
+Processes that this one starts inherit the variable, so notebooks are held to it, too; workers, which may have been
+started before, are told with each call.
 """
 
 from __future__ import annotations
@@ -28,6 +29,14 @@ def go_offline() -> None:
     """Refuse connections from now on, here and in the processes that this one starts."""
     os.environ[VARIABLE] = "1"
     watch_connections()
+
+
+def follow(offline: bool) -> None:
+    """Be offline, or not, as the process that asks for work is."""
+    if offline:
+        go_offline()
+    else:
+        os.environ.pop(VARIABLE, None)
 
 
 @cache

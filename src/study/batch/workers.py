@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from study.batch.cluster import arithmetic_of_now, connected, packed, require_same_arithmetic, unpacked
 from study.errors import StudyError
+from study.offline import follow, is_offline
 
 K = TypeVar("K", bound=Hashable)
 Call = tuple[Any, ...]  # a function and its arguments
@@ -104,7 +105,8 @@ class Workers:
         if self.n_jobs == 1:
             yield from ((number, attempt(*call)) for number, call in enumerate(calls.values()))
             return
-        todo = (delayed(_in_worker)(os.getpid(), number, *call) for number, call in enumerate(calls.values()))
+        held = os.getpid(), is_offline()
+        todo = (delayed(_in_worker)(*held, number, *call) for number, call in enumerate(calls.values()))
         try:
             yield from Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")(todo)
         except BrokenProcessPool as error:
@@ -158,8 +160,9 @@ def _peak_mb() -> float:
     return float(peak / (2**20 if sys.platform == "darwin" else 2**10))
 
 
-def _in_worker(parent: int, number: int, *call: Any) -> tuple[int, Outcome]:
+def _in_worker(parent: int, offline: bool, number: int, *call: Any) -> tuple[int, Outcome]:
     _end_with(parent)
+    follow(offline)  # a process that was started before has the environment of then
     return number, attempt(*call)
 
 
